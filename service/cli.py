@@ -1,0 +1,212 @@
+"""The `lightwell` command. Mitsuba and torch are imported inside the commands: --help answers at once."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from service.failures import reported
+from service.options import check_writable, parse_look_at, parse_overrides, parse_size
+from service.outcome import Outputs, finish, frame_request_lines
+
+if TYPE_CHECKING:
+    from workers.scene import Scene
+    from workers.settings import Settings
+
+app = typer.Typer(
+    name="lightwell",
+    help="Globally lit frames of a 3D scene from any camera pose: bake caches, train a network, measure.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+SceneArgument = Annotated[
+    str,
+    typer.Argument(help="a Mitsuba .xml, a .yaml, a mesh (.glb .gltf .obj .ply .stl), or tabletop or tiny"),
+]
+StoreOption = Annotated[str, typer.Option("--store", help="folder that holds everything that is computed")]
+PresetOption = Annotated[
+    str, typer.Option("--preset", help="draft, balanced or reference: from fast to accurate")
+]
+ResolutionOption = Annotated[
+    str | None, typer.Option("--resolution", help="WIDTHxHEIGHT in pixels; default: the scene's own")
+]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", help="key=value, one setting; may be given again")
+]
+JsonOption = Annotated[Path | None, typer.Option("--json", help="also write the result as JSON")]
+ReportOption = Annotated[
+    Path | None, typer.Option("--report", help="where the HTML report goes; default: the store")
+]
+PictureOption = Annotated[
+    Path | None, typer.Option("--picture", help="also write the first pictures as one PNG")
+]
+
+
+def _load(scene: str, resolution: str | None) -> "Scene":
+    width, height = parse_size(resolution, "--resolution") if resolution else (None, None)
+    from workers.scene import load_scene
+
+    return load_scene(scene, width=width, height=height)
+
+
+def _settings(preset: str, scene: "Scene", assignments: list[str] | None) -> "Settings":
+    """Preset, then what the scene's file asks for, then what the command line says."""
+    from workers.settings import Settings
+
+    size = {"width": scene.camera.width, "height": scene.camera.height}
+    overrides = parse_overrides(assignments or [])
+    return Settings.preset_named(preset).override({**size, **scene.settings, **overrides})
+
+
+def _run(scene: "Scene", store_url: str, settings: "Settings", outputs: Outputs) -> None:
+    from service.progress import RichProgress
+    from storage.store import Store
+    from workers.pipeline import run_scene
+
+    store = Store.open(store_url, create=True)
+    size = (settings.width, settings.height)
+    with RichProgress() as progress:
+        for note in scene.notes:
+            progress.message(f"note: {note}")
+        evaluation = run_scene(scene, store, settings, progress, camera_size=size)
+    finish(evaluation, store_url, outputs)
+
+
+@app.command()
+def demo(
+    store: StoreOption = "./lightwell-demo",
+    preset: Annotated[str, typer.Option("--preset", help="demo, draft, balanced or reference")] = "demo",
+    resolution: ResolutionOption = "256x256",
+    assignments: SetOption = None,
+    json_file: JsonOption = None,
+    report: ReportOption = None,
+    picture: PictureOption = None,
+) -> None:
+    """Bake, train and measure the built-in tabletop, then say how to ask it for a frame."""
+    with reported():
+        outputs = Outputs(json=json_file, report=report, picture=picture)
+        scene = _load("tabletop", resolution)
+        _run(scene, store, _settings(preset, scene, assignments), outputs)
+        with_server, without_server = frame_request_lines(scene.name, store, scene.camera)
+        print(f"a frame, by HTTP:      {with_server}")
+        print(f"a frame, as a command: {without_server}")
+
+
+@app.command()
+def plan(
+    scene: SceneArgument,
+    preset: PresetOption = "balanced",
+    resolution: ResolutionOption = None,
+    assignments: SetOption = None,
+) -> None:
+    """Show what a run would do for this scene, why, and what it costs. Computes nothing."""
+    with reported():
+        loaded = _load(scene, resolution)
+        settings = _settings(preset, loaded, assignments)
+        from service.table import plan_table, show
+        from workers.pipeline import plan_scene
+
+        show(plan_table(plan_scene(loaded, settings)))
+
+
+@app.command()
+def run(
+    scene: SceneArgument,
+    store: StoreOption,
+    preset: PresetOption = "balanced",
+    resolution: ResolutionOption = None,
+    assignments: SetOption = None,
+    json_file: JsonOption = None,
+    report: ReportOption = None,
+    picture: PictureOption = None,
+) -> None:
+    """Bake, render, train and evaluate. Started again, it goes on where it stopped."""
+    with reported():
+        outputs = Outputs(json=json_file, report=report, picture=picture)
+        loaded = _load(scene, resolution)
+        _run(loaded, store, _settings(preset, loaded, assignments), outputs)
+
+
+@app.command()
+def evaluate(
+    scene: SceneArgument,
+    store: StoreOption,
+    preset: PresetOption = "balanced",
+    resolution: ResolutionOption = None,
+    assignments: SetOption = None,
+    json_file: JsonOption = None,
+    report: ReportOption = None,
+    picture: PictureOption = None,
+) -> None:
+    """Measure again what an earlier run with the same preset, resolution and settings made."""
+    with reported():
+        outputs = Outputs(json=json_file, report=report, picture=picture)
+        from service.progress import RichProgress
+        from storage.store import Store
+        from workers.pipeline import evaluate_scene
+
+        opened = Store.open(store)
+        loaded = _load(scene, resolution)
+        settings = _settings(preset, loaded, assignments)
+        with RichProgress() as progress:
+            evaluation = evaluate_scene(loaded, opened, settings, progress)
+        finish(evaluation, store, outputs)
+
+
+@app.command()
+def frame(
+    scene: SceneArgument,
+    store: StoreOption,
+    look_at: Annotated[str, typer.Option("--look-at", help="ox,oy,oz,tx,ty,tz,ux,uy,uz: origin, target, up")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="a .png, .jpg or .exr file")],
+    fov: Annotated[float, typer.Option("--fov", help="field of view across the width, degrees")] = 45.0,
+    size: Annotated[str, typer.Option("--size", help="WIDTHxHEIGHT in pixels")] = "640x360",
+) -> None:
+    """One frame of a scene that a run has prepared, named by its file or by its name in the store."""
+    with reported():
+        from service.images import encode, media_type_of
+        from service.options import write_file
+
+        media_type = media_type_of(output)
+        check_writable(output, "--output")
+        width, height = parse_size(size)
+        from workers.camera import Camera
+
+        camera = Camera.look_at(*parse_look_at(look_at), fov, width, height)
+        from storage.store import Store
+
+        opened = Store.open(store)
+        from workers.renderer import FrameRenderer
+
+        name = _load(scene, None).digest if Path(scene).is_file() else scene
+        rendered = FrameRenderer.open(opened, name).render(camera)
+        write_file(output, encode(rendered.radiance, rendered.exposure, media_type))
+        times = ", ".join(f"{step} {1e3 * seconds:.1f} ms" for step, seconds in rendered.seconds.items())
+        print(f"{output}: {width}x{height}, {times}, coverage {100 * rendered.coverage:.1f} %, "
+              f"non-finite pixels {rendered.non_finite}")  # fmt: skip
+
+
+@app.command()
+def serve(
+    store: StoreOption,
+    host: Annotated[str, typer.Option("--host", help="address to listen on")] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0 takes a free one")] = 8000,
+) -> None:
+    """Answer frame requests over HTTP: POST /v1/scenes/{scene}/frame, GET /v1/scenes, /docs."""
+    with reported():
+        from service.serving import serve_store
+
+        serve_store(store, host, port)
+
+
+def main() -> None:
+    """Entry point of the `lightwell` script."""
+    os.environ.setdefault("MPLBACKEND", "Agg")
+    app()
+
+
+if __name__ == "__main__":
+    main()

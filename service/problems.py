@@ -1,0 +1,80 @@
+"""Errors over HTTP: every one is an RFC 9457 problem document (application/problem+json)."""
+
+import logging
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from models.errors import ModelError
+from service import errors
+from storage.errors import StorageError
+from workers.errors import CameraError, WorkerError
+
+PROBLEM = "application/problem+json"
+log = logging.getLogger("lightwell.service")
+
+STATUS_OF_ERROR: dict[type[Exception], int] = {
+    errors.UnknownSceneError: 404,
+    errors.NotAcceptableError: 406,
+    errors.AmbiguousSceneError: 409,
+    errors.FrameTooLargeError: 413,
+    CameraError: 422,
+    errors.ServiceError: 500,
+    WorkerError: 500,
+    StorageError: 500,
+    ModelError: 500,
+    MemoryError: 503,
+}
+"""The most derived class that is listed decides."""
+
+
+def problem(status: int, detail: str, **extra: Any) -> JSONResponse:
+    """A problem document; `title` is the status' own phrase, so `type` is about:blank and left out."""
+    content = {"title": HTTPStatus(status).phrase, "status": status, "detail": detail, **extra}
+    return JSONResponse(content, status_code=status, media_type=PROBLEM)
+
+
+def _known_error(_: Request, error: Exception) -> JSONResponse:
+    status = next(STATUS_OF_ERROR[kind] for kind in type(error).__mro__ if kind in STATUS_OF_ERROR)
+    detail = " ".join(str(error).split()) or "not enough memory for this frame; choose a smaller size"
+    if status >= 500:
+        log.error("%s: %s", type(error).__name__, detail)
+    return problem(status, detail)
+
+
+def _invalid_request(_: Request, error: Exception) -> JSONResponse:
+    """The values given are not repeated: they may be NaN, which JSON cannot hold."""
+    assert isinstance(error, RequestValidationError)
+    reasons = [
+        {"where": ".".join(str(part) for part in reason["loc"] if part != "body"), "message": reason["msg"]}
+        for reason in error.errors()
+    ]
+    detail = "; ".join(f"{reason['where'] or 'body'}: {reason['message']}" for reason in reasons)
+    return problem(422, detail, errors=reasons)
+
+
+def _http_error(_: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)
+    response = problem(error.status_code, str(error.detail))
+    response.headers.update(error.headers or {})
+    return response
+
+
+def _unknown_error(_: Request, error: Exception) -> JSONResponse:
+    """The traceback goes to the log (starlette raises on); the client learns that it was not its fault."""
+    return problem(
+        500, f"the service failed on this request ({type(error).__name__}); its log has the traceback"
+    )
+
+
+def add_problem_handlers(app: FastAPI) -> None:
+    """Makes every error of the app a problem document."""
+    for kind in STATUS_OF_ERROR:
+        app.add_exception_handler(kind, _known_error)
+    app.add_exception_handler(RequestValidationError, _invalid_request)
+    app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(Exception, _unknown_error)

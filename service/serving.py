@@ -1,0 +1,56 @@
+"""The HTTP server's process: a socket that is bound before anything slow starts, then uvicorn."""
+
+import ipaddress
+import socket
+import sys
+
+from service.errors import OptionError
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach the address; a name other than localhost counts as reachable."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def bind(host: str, port: int) -> socket.socket:
+    """A listening socket.
+
+    Raises:
+        OptionError: the address cannot be had (in use, not of this machine, no such name, not allowed).
+    """
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        return socket.create_server((str(address[0]), port), family=family)
+    except OSError as error:
+        raise OptionError(
+            f"address must be free and of this machine, got {host} port {port} ({error.strerror}); "
+            "choose another --host or --port"
+        ) from None
+
+
+def serve_store(store_url: str, host: str, port: int) -> None:
+    """Serves until it is interrupted.
+
+    Raises:
+        StorageError: there is no store at the URL.
+        OptionError: the address cannot be had.
+    """
+    import uvicorn
+
+    from service.app import create_app
+    from storage.store import Store
+
+    Store.open(store_url)
+    with bind(host, port) as listener:
+        url = f"http://{f'[{host}]' if ':' in host else host}:{listener.getsockname()[1]}"
+        if not is_loopback(host):
+            print(
+                f"lightwell: {host} can be reached from outside and nothing asks for a password",
+                file=sys.stderr,
+            )
+        print(f"serving {store_url} on {url} (API: {url}/docs)", file=sys.stderr)
+        server = uvicorn.Server(uvicorn.Config(create_app(store_url), log_level="info"))
+        server.run(sockets=[listener])

@@ -1,0 +1,140 @@
+"""The one place that knows where things lie in a store. Paths are relative to the store's root, with "/"
+everywhere.
+
+store.json                                      layout version; a folder without it is no store
+scenes/<digest>/scene.json                      name and facts of a scene
+scenes/<digest>/<stage>/<key>/<files>           one unit
+scenes/<digest>/<stage>/<key>/commit.json       its marker, written last
+scenes/<digest>/bake/<key>/caches.zarr/         a cache set: zarr v3 arrays, one chunk per bake unit
+scenes/<digest>/bake/<key>/units/000042.json    marker of one bake unit
+.../.<name>.<random>.partial                    being written, or left by a crash: never read
+"""
+
+import re
+import uuid
+from dataclasses import dataclass
+
+from storage.errors import PathNameError
+
+LAYOUT_VERSION = 1
+STORE_FILE = "store.json"
+SCENES = "scenes"
+SCENE_FILE = "scene.json"
+MARKER = "commit.json"
+CACHES = "caches.zarr"
+UNIT_MARKERS = "units"
+
+_SEGMENT = re.compile(r"[0-9A-Za-z][0-9A-Za-z_.-]{0,127}")
+_UNIT_MARKER = re.compile(r"(\d{6,})\.json")
+_MAX_NAME_NBYTES = 200  # file systems allow 255; the temporary name needs the rest
+_PARTIAL = ".partial"
+
+
+@dataclass(frozen=True)
+class UnitRef:
+    """Address of a unit: a frame, a training run, a cache set."""
+
+    scene_digest: str
+    stage: str
+    key: str
+
+    @property
+    def folder(self) -> str:
+        """Path of the unit's folder, relative to the store."""
+        return unit_folder(self.scene_digest, self.stage, self.key)
+
+    def __str__(self) -> str:
+        return f"{self.stage}/{self.key} of scene {self.scene_digest}"
+
+
+def scene_folder(digest: str) -> str:
+    return f"{SCENES}/{_segment('scene digest', digest)}"
+
+
+def scene_file(digest: str) -> str:
+    return f"{scene_folder(digest)}/{SCENE_FILE}"
+
+
+def stage_folder(digest: str, stage: str) -> str:
+    return f"{scene_folder(digest)}/{_segment('stage', stage)}"
+
+
+def unit_folder(digest: str, stage: str, key: str) -> str:
+    return f"{stage_folder(digest, stage)}/{_segment('key', key)}"
+
+
+def unit_marker(folder: str) -> str:
+    return f"{folder}/{MARKER}"
+
+
+def unit_file(folder: str, name: str) -> str:
+    return f"{folder}/{file_name(name)}"
+
+
+def array_name(name: str) -> str:
+    """Checks the name of a cache array."""
+    return _segment("array name", name)
+
+
+def caches_folder(folder: str) -> str:
+    return f"{folder}/{CACHES}"
+
+
+def chunk_file(array: str, index: int, num_axes: int) -> str:
+    """Path of a bake unit's chunk inside the unit folder, by zarr's default chunk keys."""
+    return "/".join([CACHES, array, "c", str(index), *["0"] * (num_axes - 1)])
+
+
+def bake_markers_folder(folder: str) -> str:
+    return f"{folder}/{UNIT_MARKERS}"
+
+
+def bake_marker(folder: str, index: int) -> str:
+    return f"{bake_markers_folder(folder)}/{index:06d}.json"
+
+
+def bake_marker_index(name: str) -> int | None:
+    """Index of the bake unit whose marker has this file name; None for any other file."""
+    match = _UNIT_MARKER.fullmatch(name)
+    return int(match.group(1)) if match else None
+
+
+def partial_name(path: str) -> str:
+    """A fresh name beside `path` (same folder, so a rename stays on one file system)."""
+    folder, _, name = path.rpartition("/")
+    return f"{folder}/.{name}.{uuid.uuid4().hex[:12]}{_PARTIAL}"
+
+
+def is_segment(name: str) -> bool:
+    """Whether a name could be a scene's, a stage's or a unit's; others (.DS_Store) are not ours."""
+    return _SEGMENT.fullmatch(name) is not None
+
+
+def is_partial(name: str) -> bool:
+    return name.startswith(".") and name.endswith(_PARTIAL)
+
+
+def file_name(name: str) -> str:
+    """Checks the name of a file in a unit: any letters, one path segment, not hidden, not the marker's.
+
+    Raises:
+        PathNameError: the name breaks one of these rules.
+    """
+    printable = isinstance(name, str) and name.isprintable() and not set(name) & set('/\\:*?"<>|')
+    fits = printable and 0 < len(name.encode("utf-8", "surrogatepass")) <= _MAX_NAME_NBYTES
+    if not fits or name.startswith(".") or name in (MARKER, UNIT_MARKERS, CACHES):
+        raise PathNameError(
+            f"file name must be one visible path segment of at most {_MAX_NAME_NBYTES} bytes other than "
+            f"{MARKER}, {UNIT_MARKERS} and {CACHES}, got {name!r}; rename it"
+        )
+    return name
+
+
+def _segment(what: str, text: str) -> str:
+    if not isinstance(text, str) or not is_segment(text):
+        raise PathNameError(
+            f"{what} must be 1 to 128 letters, digits, '_', '-' or '.', starting with a letter or digit, "
+            f"got {text!r}; "
+            "use a digest or a plain name"
+        )
+    return text

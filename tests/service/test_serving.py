@@ -1,0 +1,51 @@
+"""The server's socket, and a real server on it."""
+
+import socket
+import threading
+import time
+import urllib.request
+from typing import Any
+
+import pytest
+import uvicorn
+
+from service.app import create_app
+from service.errors import OptionError
+from service.serving import bind, is_loopback
+
+
+@pytest.mark.parametrize(
+    ("host", "loopback"),
+    [
+        ("127.0.0.1", True),
+        ("127.9.9.9", True),
+        ("::1", True),
+        ("localhost", True),
+        ("0.0.0.0", False),
+        ("a.b", False),
+    ],
+)
+def test_is_loopback(host: str, loopback: bool) -> None:
+    assert is_loopback(host) is loopback
+
+
+def test_a_port_in_use_is_an_option_error() -> None:
+    with bind("127.0.0.1", 0) as taken, pytest.raises(OptionError, match="choose another --host or --port"):
+        bind("127.0.0.1", taken.getsockname()[1])
+
+
+def test_a_bound_socket_is_served(backend: Any) -> None:
+    app = create_app("unused", make_backend=lambda: backend)
+    with bind("127.0.0.1", 0) as listener:
+        assert listener.family == socket.AF_INET
+        server = uvicorn.Server(uvicorn.Config(app, log_level="error"))
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        deadline_s = time.monotonic() + 10
+        while not server.started and time.monotonic() < deadline_s:
+            time.sleep(0.01)
+        url = f"http://127.0.0.1:{listener.getsockname()[1]}/healthz"
+        body = urllib.request.build_opener(urllib.request.ProxyHandler({})).open(url, timeout=10).read()
+        server.should_exit = True
+        thread.join(10)
+    assert body == b'{"status":"ok"}' and not thread.is_alive()

@@ -1,0 +1,1 @@
+"""Mitsuba and the stages: one file a stage, and the nouns they share."""

@@ -1,0 +1,156 @@
+"""What a material does with light, and how its radiance is split into lobes that are cached apart.
+
+The exitant radiance of a surface is written as (the split is exact for the light at a cache element)
+
+    L_o(x, wo) = Le(x, wo) + rho_d(x, wo) * D(x) + t_s(x, wo) * S(x, wo) + delta chain
+
+with D the irradiance over pi (one number: a Lambertian lobe has no direction), rho_d the diffuse reflectance at
+the *pixel* (so texture never enters the cache), S the remaining non-delta lobe divided by its tint t_s, and
+delta lobes followed by rays at query time.
+
+Directions: Mitsuba's `si.wi` is the viewer (our wo) and its `wo` the light (our wi); the conversion is here.
+"""
+
+from enum import IntFlag
+
+import numpy as np
+
+from workers.backend import dr, mi
+
+# The light direction at which a masked diffuse lobe is probed: 60 degrees, close to the mean of a cosine lobe.
+PROBE_COSINE = 0.5
+PROBE_SINE = float(np.sqrt(1 - PROBE_COSINE**2))
+MIN_TINT = 0.02
+
+
+class LobeClass(IntFlag):
+    """Lobes of a material, as bits that travel into kernels."""
+
+    DIFFUSE = 1  # has a diffuse reflection lobe: cached as one number
+    GLOSSY = 2  # has a non-delta lobe besides: cached by direction
+    DELTA = 4  # has mirror, ideal transmission or null lobes: followed at query time
+    PRINCIPLED = 8  # a principled material: split by its parameters, it ignores component masks
+    MASKABLE = 16  # honours `BSDFContext.type_mask`, so its lobes can be evaluated apart
+    EMITTER = 32
+    FRONT_ONLY = 64  # a principled material that is black from behind
+    WHOLE = 128  # masks tear its diffuse lobe apart: the directional cache takes every non-delta lobe
+
+
+def context(mask: int) -> "mi.BSDFContext":
+    """A BSDF context restricted to some lobe types."""
+    ctx = mi.BSDFContext()
+    ctx.type_mask = mask
+    return ctx
+
+
+def classify_bsdf(bsdf: "mi.BSDF", *, is_emitter: bool = False) -> LobeClass:
+    """Reads a material's flags and tests numerically whether its lobes can be evaluated apart."""
+    flags = bsdf.flags()
+    lobe = LobeClass.EMITTER if is_emitter else LobeClass(0)
+    if mi.has_flag(flags, mi.BSDFFlags.Delta):
+        lobe |= LobeClass.DELTA
+    if mi.has_flag(flags, mi.BSDFFlags.DiffuseReflection):
+        lobe |= LobeClass.DIFFUSE
+    glossy = mi.has_flag(flags, mi.BSDFFlags.Glossy) or mi.has_flag(flags, mi.BSDFFlags.DiffuseTransmission)
+    if glossy:
+        lobe |= LobeClass.GLOSSY
+    if bsdf.has_attribute("base_color") and bsdf.has_attribute("metallic"):
+        return lobe | LobeClass.PRINCIPLED | (LobeClass(0) if _reflects_behind(bsdf) else LobeClass.FRONT_ONLY)
+    if lobe & LobeClass.DIFFUSE and (not glossy or _is_maskable(bsdf)):
+        return lobe | LobeClass.MASKABLE
+    # A diffuse part that cannot be told apart from the rest is left in the directional lobe.
+    whole = lobe & ~LobeClass.DIFFUSE | LobeClass.GLOSSY | LobeClass.WHOLE
+    return whole if lobe & LobeClass.DIFFUSE else lobe
+
+
+def _reflects_behind(bsdf: "mi.BSDF") -> bool:
+    si = dr.zeros(mi.SurfaceInteraction3f, 1)
+    si.wi = dr.normalize(mi.Vector3f(0.3, 0.2, -0.9))
+    wo = dr.normalize(mi.Vector3f(-0.4, 0.2, -0.9))
+    return bool(np.any(np.array(bsdf.eval(mi.BSDFContext(), si, wo)) > 0))
+
+
+def _is_maskable(bsdf: "mi.BSDF") -> bool:
+    si = dr.zeros(mi.SurfaceInteraction3f, 3)
+    si.wi = dr.normalize(mi.Vector3f([0.3, -0.5, 0.1], [0.1, 0.4, 0.2], [0.9, 0.6, 0.9]))
+    wo = dr.normalize(mi.Vector3f([-0.3, 0.4, -0.1], [-0.1, 0.2, -0.2], [0.9, 0.5, 0.9]))
+    parts = [mi.BSDFFlags.Diffuse, mi.BSDFFlags.Glossy, mi.BSDFFlags.All]
+    diffuse, glossy, everything = (np.array(bsdf.eval(context(part), si, wo)) for part in parts)
+    separate = bool(np.any(np.abs(diffuse - everything) > 1e-4 * np.abs(everything) + 1e-9))
+    return separate and bool(np.allclose(diffuse + glossy, everything, rtol=1e-3, atol=1e-6))
+
+
+def has(bits: "mi.UInt32", lobe: LobeClass) -> "mi.Bool":
+    """Mask of the lanes whose class has a lobe."""
+    return (bits & int(lobe)) != 0
+
+
+def diffuse_reflectance(
+    bsdf: "mi.BSDFPtr",
+    si: "mi.SurfaceInteraction3f",
+    bits: "mi.UInt32",
+    union: LobeClass,
+    active: "mi.Bool",
+) -> "mi.Color3f":
+    """rho_d(x, wo): the factor that turns D into the radiance of the diffuse lobe.
+
+    pi * f_d(wo, wi) with wi at 60 degrees in the plane of the viewer: exact for a Lambertian lobe, and with the
+    viewer's Fresnel transmittance for coated ones. A principled material gives (1 - metallic) * base_color.
+    """
+    result = dr.zeros(mi.Color3f, dr.width(si))
+    if union & LobeClass.MASKABLE:
+        masked = active & has(bits, LobeClass.MASKABLE) & has(bits, LobeClass.DIFFUSE)
+        side = dr.sign(si.wi.z)
+        wi_light = mi.Vector3f(PROBE_SINE, 0.0, PROBE_COSINE * side)
+        value = bsdf.eval(context(mi.BSDFFlags.Diffuse), si, wi_light, masked)
+        result = dr.select(masked, value * (dr.pi / PROBE_COSINE), result)
+    if union & LobeClass.PRINCIPLED:
+        principled = active & has(bits, LobeClass.PRINCIPLED)
+        principled &= (si.wi.z > 0) | ~has(bits, LobeClass.FRONT_ONLY)
+        base, metallic, transmission = principled_parameters(bsdf, si, principled)
+        result = dr.select(principled, base * (1 - metallic) * (1 - transmission), result)
+    return result
+
+
+def principled_parameters(
+    bsdf: "mi.BSDFPtr", si: "mi.SurfaceInteraction3f", active: "mi.Bool"
+) -> "tuple[mi.Color3f, mi.Float, mi.Float]":
+    """Base colour, metallic and specular transmission of principled materials (0 where absent)."""
+    base = bsdf.eval_attribute_3("base_color", si, active)
+    metallic = bsdf.eval_attribute_1("metallic", si, active & bsdf.has_attribute("metallic", active))
+    transmissive = active & bsdf.has_attribute("spec_trans", active)
+    transmission = bsdf.eval_attribute_1("spec_trans", si, transmissive)
+    return base, metallic, dr.select(transmissive, transmission, 0.0)
+
+
+def specular_tint(
+    bsdf: "mi.BSDFPtr",
+    si: "mi.SurfaceInteraction3f",
+    bits: "mi.UInt32",
+    union: LobeClass,
+    active: "mi.Bool",
+) -> "mi.Color3f":
+    """t_s(x, wo): the colour by which the directional lobe is divided in the cache; 1 where it has none.
+
+    Schlick's Fresnel of a principled material (its metals take their colour from a texture).
+    """
+    tint = dr.full(mi.Color3f, 1.0, dr.width(si))
+    if union & LobeClass.PRINCIPLED:
+        principled = active & has(bits, LobeClass.PRINCIPLED)
+        base, metallic, transmission = principled_parameters(bsdf, si, principled)
+        f0 = dr.lerp(mi.Color3f(0.04), base, metallic)
+        grazing = dr.power(1 - dr.minimum(dr.abs(si.wi.z), 1.0), 5)
+        value = dr.maximum(f0 + (1 - f0) * grazing, MIN_TINT)
+        value = dr.lerp(value, mi.Color3f(1.0), transmission)
+        tint = dr.select(principled, value, tint)
+    return tint
+
+
+def reflectance_at(table, elements) -> np.ndarray:  # type: ignore[no-untyped-def]
+    """rho_d at cache elements seen along their normal, float32 [n, 3] (to undo demodulation)."""
+    si = table.interaction(elements.shape, elements.prim_local, elements.uv)
+    sign = np.where(elements.side == 1, -1.0, 1.0).astype(np.float32)
+    si.wi = mi.Vector3f(0.0, 0.0, mi.Float(sign))
+    bits = dr.gather(mi.UInt32, table.lobe_bits_dr, mi.UInt32(elements.shape.astype(np.uint32)))
+    rho = diffuse_reflectance(si.bsdf(), si, bits, table.lobe_union, mi.Bool(True))
+    return np.ascontiguousarray(np.array(rho).T.astype(np.float32))

@@ -1,0 +1,134 @@
+"""The main job, stage by stage: elements, bake, render, inputs, train, evaluate.
+
+Every stage asks the store what is there and does the rest, so a run that was stopped goes on where it was.
+"""
+
+import time
+from typing import Any
+
+import torch
+
+from storage.store import Store, UnitRef
+from workers.bake import bake_refs, cache_nbytes, load_caches, run_bake
+from workers.backend import dr
+from workers.element_stage import run_elements
+from workers.elements import ElementSet
+from workers.errors import WorkerError
+from workers.evaluate import Evaluation, Picture, run_evaluation
+from workers.inputs import inputs_ref, run_inputs
+from workers.plan import plan_rows
+from workers.progress import Progress
+from workers.query import QueryProgram
+from workers.reconstruct import Reconstructor
+from workers.render import render_ref, run_render
+from workers.renderer import FrameRenderer, publish
+from workers.run_state import RunState
+from workers.scene import Scene
+from workers.settings import Settings
+from workers.train import WEIGHTS_FILE, load_network, run_train, train_ref
+
+__all__ = ["Evaluation", "Picture", "evaluate_scene", "plan_scene", "run_scene"]
+
+RENDER_STAGES = {"train": "render training frames", "validation": "render validation frames",
+                 "test": "render test references"}  # fmt: skip
+
+
+def plan_scene(scene: Scene, settings: Settings) -> dict[str, Any]:
+    """What a run would do and cost; nothing is rendered."""
+    return plan_rows(scene, settings)
+
+
+def run_scene(
+    scene: Scene, store: Store, settings: Settings, progress: Progress,
+    *, camera_size: tuple[int, int] | None = None,
+) -> Evaluation:  # fmt: skip
+    """Runs every stage and evaluates.
+
+    Args:
+        scene: a loaded scene.
+        store: where everything goes.
+        settings: what to do.
+        progress: told about it.
+        camera_size: (width, height) of all frames; the settings' where None.
+    """
+    width, height = camera_size or (settings.width, settings.height)
+    run = RunState(scene, store, settings.override({"width": width, "height": height}), progress)
+    store.register_scene(scene.digest, _known(store, scene) | {"name": scene.name, "source": str(scene.source)})
+    elements = run_elements(run)
+    run_bake(run, elements)
+    frames = run.settings.frames
+    renders = {
+        "train": run_render(run, run.paths.train, frames.train_spp, RENDER_STAGES["train"]),
+        "validation": run_render(run, run.paths.validation, frames.train_spp, RENDER_STAGES["validation"]),
+        "test": run_render(run, run.paths.test, frames.test_spp, RENDER_STAGES["test"]),
+    }
+    program = _program(run, elements)
+    inputs = {
+        "train": run_inputs(run, elements, program, run.paths.train),
+        "validation": run_inputs(run, elements, program, run.paths.validation),
+    }
+    network = run_train(run, (inputs["train"], renders["train"]), (inputs["validation"], renders["validation"]))
+    evaluation = _evaluate(run, elements, program, network, renders["test"])
+    publish(run, network, evaluation.result["rows"][0]["psnr"])
+    return evaluation
+
+
+def evaluate_scene(scene: Scene, store: Store, settings: Settings, progress: Progress) -> Evaluation:
+    """Evaluates what `run_scene` prepared with the settings that it used.
+
+    Raises:
+        WorkerError: a stage has not run.
+    """
+    entry = _known(store, scene)
+    used = Settings.from_json(entry["settings"]) if "settings" in entry else settings
+    run = RunState(scene, store, used, progress)
+    elements = run_elements(run)
+    renders = {name: [render_ref(run, camera, spp) for camera in cameras] for name, cameras, spp in (
+        ("train", run.paths.train, used.frames.train_spp), ("test", run.paths.test, used.frames.test_spp))}  # fmt: skip
+    network = train_ref(run, [inputs_ref(run, elements, camera) for camera in run.paths.train], renders["train"])
+    needed = [network, *renders["test"], *bake_refs(run, elements).values()]
+    if any(store.committed(ref) is None for ref in needed):
+        raise WorkerError(
+            f"scene {scene.name!r} must be run before it is evaluated; "
+            f"run: lightwell run {scene.source} --store {store.url}"
+        )
+    return _evaluate(run, elements, _program(run, elements), network, renders["test"])
+
+
+def _known(store: Store, scene: Scene) -> dict[str, Any]:
+    """What the store says of the scene, without the fields that the store adds itself."""
+    for entry in store.scenes():
+        if entry["digest"] == scene.digest:
+            return {key: value for key, value in entry.items() if key != "digest"}
+    return {}
+
+
+def _program(run: RunState, elements: ElementSet) -> QueryProgram:
+    caches = load_caches(run, elements)
+    return QueryProgram(run.scene.mi_scene, run.table, elements, caches, run.settings.query)
+
+
+def _evaluate(
+    run: RunState, elements: ElementSet, program: QueryProgram, network_ref: UnitRef, test_refs: list[UnitRef]
+) -> Evaluation:
+    start = time.perf_counter()
+    torch.set_num_threads(dr.thread_count())
+    network, encoding = load_network(run, network_ref)
+    renderer = FrameRenderer(
+        program, Reconstructor(network, encoding, precision=run.settings.train.precision, compile=True)
+    )
+    sizes = {"cache": cache_nbytes(run, elements), "network": len(run.store.read(network_ref, WEIGHTS_FILE))}
+    evaluation = run_evaluation(run, renderer, test_refs, stage_seconds(run, elements, network_ref), sizes)
+    run.seconds["evaluate"] = time.perf_counter() - start
+    evaluation.result["stages"].append({"name": "evaluate", "seconds": run.seconds["evaluate"]})
+    return evaluation
+
+
+def stage_seconds(run: RunState, elements: ElementSet, network_ref: UnitRef) -> dict[str, float]:
+    """Seconds of preprocessing by stage, from the records of the units, so that a resumed run tells them too."""
+    del elements
+    result = dict(run.seconds)
+    record = run.store.committed(network_ref)
+    if record is not None:
+        result.setdefault("train", float(record["seconds"]))
+    return result

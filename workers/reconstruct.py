@@ -1,0 +1,153 @@
+"""Inference: queried features to a frame, with precision and compilation chosen by measurement."""
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from models.metrics import psnr, tone_map
+from models.network import FusionNet, NetworkConfig
+from models.transfer import Transfer
+from workers.query import CHANNELS
+
+# bf16 is used only where its frame is this close to fp32's: far below what any reference can resolve.
+BF16_GATE_DB = 50.0
+PROBE_REPEATS = 3
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How features enter and leave network space; saved with every network.
+
+    Attributes:
+        exposure: e; networks work on e * L.
+        distance_scale: d_max, scene units: distance enters as d / d_max.
+        transfer: curve of radiance.
+    """
+
+    exposure: float
+    distance_scale: float
+    transfer: Transfer
+
+    def inputs(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """[batch, height, width, channels] features to (IR, G-buffer), channels-first views of channels-last memory."""
+        a, b = CHANNELS["ir"]
+        ir = self.transfer.forward(features[..., a:b] * self.exposure)
+        start, end = CHANNELS["normal"][0], CHANNELS["distance"][1]
+        gbuffer = features[..., start:end].clone()
+        gbuffer[..., -1].div_(self.distance_scale).clamp_(0.0, 1.0)
+        return ir.permute(0, 3, 1, 2), gbuffer.permute(0, 3, 1, 2)
+
+    def radiance(self, output: Tensor) -> Tensor:
+        """Network output [batch, 3, height, width] to linear scene radiance, the same shape."""
+        return self.transfer.inverse(output.float()) / self.exposure
+
+    def to_json(self) -> dict[str, Any]:
+        return {"exposure": self.exposure, "distance_scale": self.distance_scale, "curve": self.transfer.curve,
+                "mu": self.transfer.mu}  # fmt: skip
+
+    @classmethod
+    def from_json(cls, value: dict[str, Any]) -> "Encoding":
+        return cls(value["exposure"], value["distance_scale"], Transfer(curve=value["curve"], mu=value["mu"]))
+
+
+GBUFFER_CHANNELS = CHANNELS["distance"][1] - CHANNELS["normal"][0]
+
+
+def pad_to_multiple(tensor: Tensor, multiple: int) -> Tensor:
+    """Repeats the last row and column until height and width are multiples; NCHW."""
+    height, width = tensor.shape[-2:]
+    bottom, right = -height % multiple, -width % multiple
+    return F.pad(tensor, (0, right, 0, bottom), mode="replicate") if bottom or right else tensor
+
+
+class Reconstructor:
+    """A trained network ready to turn features into frames.
+
+    Args:
+        network: the network, fp32.
+        encoding: its transfer functions.
+        precision: "fp32", "bf16" or "auto" (bf16 where it passes `BF16_GATE_DB` and is faster).
+        compile: try `torch.compile` and keep it where it is faster; costs tens of seconds a size.
+    """
+
+    def __init__(
+        self, network: FusionNet, encoding: Encoding, *, precision: str = "auto", compile: bool = False
+    ) -> None:
+        self.encoding = encoding
+        self.device = next(network.parameters()).device
+        self.config: NetworkConfig = network.config
+        self._fp32 = network.eval().to(memory_format=torch.channels_last)
+        self._precision, self._compile = precision, compile
+        self._chosen: dict[tuple[int, int], Any] = {}
+        self.choices: dict[str, str] = {}
+
+    def __call__(self, features: np.ndarray) -> np.ndarray:
+        """float32 [height, width, NUM_CHANNELS] to linear radiance, float32 [height, width, 3]."""
+        height, width = features.shape[:2]
+        with torch.inference_mode():
+            tensor = torch.from_numpy(features)[None].to(self.device, non_blocking=True)
+            inputs = [pad_to_multiple(x, self.config.size_multiple) for x in self.encoding.inputs(tensor)]
+            if (height, width) not in self._chosen:
+                self._chosen[height, width] = self._choose(inputs, (height, width))
+            network = self._chosen[height, width]
+            output = network(*inputs)[..., :height, :width]
+            radiance = self.encoding.radiance(output)[0].permute(1, 2, 0)
+            return np.ascontiguousarray(radiance.cpu().numpy())
+
+    def _choose(self, inputs: list[Tensor], size: tuple[int, int]) -> Any:
+        """Measures the candidates on real input of this size, once."""
+        candidates: dict[str, Any] = {"fp32": self._fp32}
+        if self._precision != "fp32" and self._passes_gate(inputs):
+            candidates["bf16"] = self._bf16()
+        if self._precision == "bf16" and "bf16" in candidates:
+            del candidates["fp32"]
+        times = {name: _seconds(network, inputs) for name, network in candidates.items()}
+        best = min(times, key=lambda name: times[name])
+        network = candidates[best]
+        if self._compile:
+            compiled = _try_compile(network, inputs)
+            if compiled is not None and _seconds(compiled, inputs) < times[best]:
+                network, best = compiled, f"{best} compiled"
+        self.choices[f"{size[1]}x{size[0]}"] = best
+        return network
+
+    def _bf16(self) -> FusionNet:
+        network = FusionNet(self.config).to(self.device)
+        network.load_state_dict(self._fp32.state_dict())
+        return network.eval().to(dtype=torch.bfloat16, memory_format=torch.channels_last)
+
+    def _passes_gate(self, inputs: list[Tensor]) -> bool:
+        exposure = self.encoding.exposure
+        frames = [self.encoding.radiance(net(*inputs))[0].permute(1, 2, 0).cpu().numpy()
+                  for net in (self._fp32, self._bf16())]  # fmt: skip
+        if not all(np.isfinite(frame).all() for frame in frames):
+            return False
+        return psnr(tone_map(frames[1], exposure), tone_map(frames[0], exposure)) >= BF16_GATE_DB
+
+
+def _seconds(network: Any, inputs: list[Tensor]) -> float:
+    """Best of a few runs after a warm-up."""
+    network(*inputs)
+    times = []
+    for _ in range(PROBE_REPEATS):
+        start = time.perf_counter()
+        network(*inputs)
+        if inputs[0].is_cuda:
+            torch.cuda.synchronize()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def _try_compile(network: Any, inputs: list[Tensor]) -> Any:
+    """The compiled network, or None where this machine cannot compile (no C++ compiler, say)."""
+    try:
+        compiled = torch.compile(network, dynamic=False)
+        compiled(*inputs)
+    except Exception:  # torch raises many kinds; eager is always there
+        return None
+    return compiled

@@ -1,0 +1,138 @@
+"""Frames of a prepared scene: what the service asks for."""
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from storage.errors import StorageError
+from storage.store import Store, UnitRef
+from workers.bake import load_caches
+from workers.camera import Camera
+from workers.element_stage import run_elements
+from workers.errors import WorkerError
+from workers.progress import Progress
+from workers.query import CHANNELS, QueryProgram
+from workers.reconstruct import Reconstructor
+from workers.run_state import RunState
+from workers.scene import load_scene
+from workers.settings import Settings
+from workers.train import load_network
+
+SERVE_STAGE = "serve"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One reconstructed frame.
+
+    Attributes:
+        radiance: linear scene radiance, float32 [height, width, 3].
+        seconds: wall seconds of "query" and "network".
+        coverage: share of radiance lookups answered by baked elements, in [0, 1].
+        exposure: the scene's exposure, to show the frame.
+        non_finite: values that are NaN or infinite (reported, never hidden).
+    """
+
+    radiance: np.ndarray
+    seconds: dict[str, float]
+    coverage: float
+    exposure: float
+    non_finite: int
+
+
+class FrameRenderer:
+    """Caches, query program and network of one scene, ready for any camera pose."""
+
+    def __init__(self, program: QueryProgram, reconstructor: Reconstructor) -> None:
+        self.program = program
+        self.reconstructor = reconstructor
+
+    @classmethod
+    def open(
+        cls, store: Store, scene_name: str, *, progress: Progress | None = None, compile: bool = False,
+        warm_up: bool = True,
+    ) -> "FrameRenderer":  # fmt: skip
+        """Loads what `run_scene` prepared.
+
+        Args:
+            store: where it lies.
+            scene_name: name or digest of the scene.
+            progress: where progress goes.
+            compile: try a compiled network (tens of seconds a frame size).
+            warm_up: render one frame of the run's own size first.
+
+        Raises:
+            StorageError, WorkerError: the scene is not in the store, was not run to its end, or has changed.
+        """
+        entry = store.find_scene(scene_name)
+        run, network_ref = open_run(store, entry, progress or Progress())
+        network, encoding = load_network(run, network_ref)
+        elements = run_elements(run)
+        program = QueryProgram(
+            run.scene.mi_scene, run.table, elements, load_caches(run, elements), run.settings.query
+        )
+        precision = run.settings.train.precision
+        renderer = cls(program, Reconstructor(network, encoding, precision=precision, compile=compile))
+        if warm_up:
+            renderer.render(run.scene.camera.resized(run.settings.width, run.settings.height))
+        return renderer
+
+    def render(self, camera: Camera) -> Frame:
+        """Reconstructs the frame of a camera; any pose is answered."""
+        start = time.perf_counter()
+        features = self.program.run(camera)
+        queried = time.perf_counter()
+        radiance = self.reconstructor(features)
+        finished = time.perf_counter()
+        a, b = CHANNELS["coverage"]
+        return Frame(
+            radiance=radiance,
+            seconds={"query": queried - start, "network": finished - queried},
+            coverage=float(np.mean(features[..., a:b])),
+            exposure=self.reconstructor.encoding.exposure,
+            non_finite=int(radiance.size - np.isfinite(radiance).sum()),
+        )
+
+
+def publish(run: RunState, network_ref: UnitRef, psnr: float | None) -> None:
+    """Makes a finished run the one that its scene is served from."""
+    run.store.register_scene(
+        run.scene.digest,
+        {
+            "name": run.scene.name, "source": str(run.scene.source), "settings": run.settings.to_json(),
+            "network": network_ref.key, "width": run.settings.width, "height": run.settings.height,
+            "preset": run.settings.preset, "psnr": psnr,
+        },
+    )  # fmt: skip
+
+
+def open_run(store: Store, entry: dict[str, Any], progress: Progress) -> tuple[RunState, UnitRef]:
+    """The run that a scene is served from and its network.
+
+    Raises:
+        WorkerError: the scene was never run to its end, or its files have changed since.
+    """
+    if "network" not in entry:
+        raise WorkerError(
+            f"scene {entry['name']!r} must have a trained network in {store.url}, got none; "
+            f"run: lightwell run {entry.get('source', 'SCENE')} --store {store.url}"
+        )
+    settings = Settings.from_json(entry["settings"])
+    scene = load_scene(entry["source"], width=settings.width, height=settings.height)
+    if scene.digest != entry["digest"]:
+        raise WorkerError(
+            f"scene {entry['name']!r} must be what its caches were baked for, but its files have changed; "
+            f"run: lightwell run {entry['source']} --store {store.url}"
+        )
+    return RunState(scene, store, settings, progress), UnitRef(scene.digest, "train", entry["network"])
+
+
+def renderable_scenes(store: Store) -> list[dict[str, Any]]:
+    """Scenes of a store that can be served."""
+    names = ("name", "digest", "width", "height", "preset", "psnr")
+    try:
+        return [{name: entry.get(name) for name in names} for entry in store.scenes() if "network" in entry]
+    except StorageError:
+        raise

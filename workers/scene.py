@@ -1,0 +1,222 @@
+"""A scene as every stage sees it: Mitsuba's scene, its own camera, what determines it and what was noted
+about it.
+
+load_scene("scene.xml") | load_scene("scene.yaml") | load_scene("chair.glb") | load_scene("tabletop")
+"""
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from workers.backend import mi
+from workers.builtin_scenes import BUILTIN_SCENES, read_builtin
+from workers.camera import Camera
+from workers.errors import SceneError
+from workers.scene_check import bounds, check_scene
+from workers.scene_draft import SceneDraft
+from workers.scene_mesh import MESH_SUFFIXES, read_mesh
+from workers.scene_nodes import (
+    audit_nodes,
+    first_sensor,
+    horizontal_fov_deg,
+    instantiate,
+    name_shapes,
+    path_max_depth,
+    sensor_pose,
+    set_film_size,
+)
+from workers.scene_xml import read_xml
+from workers.scene_yaml import YAML_SUFFIXES, read_yaml
+
+DIGEST_VERSION = 1
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scene:
+    """A loaded, checked scene.
+
+    Attributes:
+        name: slug for folders and reports.
+        digest: sha256 hex over everything that determines the light in it (files, textures, meshes, a
+            `max_depth` that was asked for); neither image size nor camera keyframes of a YAML file count.
+        mi_scene: the `mi.Scene`; every shape has an id that is the same in every process, none are merged.
+        camera: the scene's own view.
+        keyframes: views that a camera path should pass through; may be empty.
+        test_keyframes: views that the test path should pass through; may be empty.
+        max_depth: longest path in edges, -1 for unlimited.
+        near_clip: closest distance along the view that is seen, scene units.
+        far_clip: farthest distance along the view that is seen, scene units.
+        notes: what was added, changed or ignored, one line each.
+        settings: overrides of the run's settings that the scene file asks for.
+        source: what `load_scene` was given.
+    """
+
+    name: str
+    digest: str
+    mi_scene: Any
+    camera: Camera
+    keyframes: tuple[Camera, ...] = ()
+    test_keyframes: tuple[Camera, ...] = ()
+    max_depth: int
+    near_clip: float
+    far_clip: float
+    notes: tuple[str, ...] = ()
+    settings: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    source: str
+
+    @property
+    def bounds_centre(self) -> np.ndarray:
+        """[3] centre of the bounding box, scene units."""
+        return bounds(self.mi_scene)[0]
+
+    @property
+    def bounds_diagonal(self) -> float:
+        """Diagonal of the bounding box, scene units."""
+        return bounds(self.mi_scene)[1]
+
+    def make_sensor(self, camera: Camera, spp: int = 1) -> Any:
+        """`mi.Sensor` for a camera: float32 RGB film, box filter, independent sampler.
+
+        The box filter keeps a repeated seed bit-identical; a sensor belongs to no scene and may be used with
+        any.
+        """
+        return mi.load_dict(
+            {
+                "type": "perspective",
+                "to_world": mi.ScalarTransform4f(camera.to_world.tolist()),
+                "fov": camera.fov_deg,
+                "fov_axis": "x",
+                "near_clip": self.near_clip,
+                "far_clip": self.far_clip,
+                "sampler": {"type": "independent", "sample_count": int(spp)},
+                "film": {
+                    "type": "hdrfilm",
+                    "width": camera.width,
+                    "height": camera.height,
+                    "pixel_format": "rgb",
+                    "component_format": "float32",
+                    "rfilter": {"type": "box"},
+                },
+            }
+        )
+
+
+def load_scene(source: str | Path, *, width: int | None = None, height: int | None = None,
+               max_depth: int | None = None) -> Scene:  # fmt: skip
+    """Read, check and build a scene.
+
+    Args:
+        source: path of a Mitsuba XML, a YAML or a mesh file, or the name of a built-in scene
+            ("tabletop", "tiny", also "builtin:tabletop").
+        width: image width in pixels; default: the scene's film, or from `height` and the film's aspect.
+        height: image height in pixels, likewise.
+        max_depth: replaces the longest path of the file's integrator, in edges; -1 is unlimited.
+
+    Raises:
+        SceneError: the scene is missing, broken, or asks for what caches cannot represent.
+        CameraError: the image size is not usable.
+    """
+    name, draft = _read(source)
+    draft.notes += audit_nodes(draft.state, draft.what)
+    name_shapes(draft.state)
+    sensor, sensor_notes = first_sensor(draft.state, draft.what)
+    draft.notes += sensor_notes
+    if sensor is None and draft.make_camera is None:
+        raise SceneError(f'{draft.what} must hold a sensor, got none; add a <sensor type="perspective">')
+    for option, size in (("width", width), ("height", height)):
+        if size is not None and size < 1:
+            raise SceneError(f"image {option} must be at least 1 pixel, got {size}")
+    pixels = set_film_size(draft.state, width, height, draft.what)
+    file_depth = path_max_depth(draft.state)
+    depth = _checked_depth(file_depth if max_depth is None else max_depth)
+    pose = None
+    if sensor is not None:
+        pose, pose_notes = sensor_pose(sensor, draft.what)
+        draft.notes += pose_notes
+        clips = [_float_property(sensor, key) for key in ("near_clip", "far_clip")]
+    else:
+        clips = [None, None]
+    mi_scene = instantiate(draft.state, draft.what)
+    draft.notes += check_scene(mi_scene, draft.what)
+    if pose is not None:
+        camera = Camera(pose, horizontal_fov_deg(sensor, *pixels, draft.what), *pixels)
+    else:
+        assert draft.make_camera is not None
+        camera = draft.make_camera(*pixels)
+    near, far = _clip_distances(mi_scene, camera, clips[0], clips[1])
+    return Scene(
+        name=name,
+        digest=_digest(draft, depth if depth != file_depth else None),
+        mi_scene=mi_scene,
+        camera=camera,
+        keyframes=draft.make_keyframes(camera) if draft.make_keyframes else (),
+        test_keyframes=draft.make_test_keyframes(camera) if draft.make_test_keyframes else (),
+        max_depth=depth,
+        near_clip=near,
+        far_clip=far,
+        notes=tuple(draft.notes),
+        settings=MappingProxyType(draft.settings),
+        source=str(source),
+    )
+
+
+def _read(source: str | Path) -> tuple[str, SceneDraft]:
+    """Choose the reader; returns the scene's slug and its draft."""
+    builtin = str(source).removeprefix("builtin:")
+    if builtin in BUILTIN_SCENES and not Path(str(source)).is_file():
+        return builtin, read_builtin(builtin)
+    if str(source).startswith("builtin:"):
+        raise SceneError(
+            f"built-in scene must be one of {', '.join(sorted(BUILTIN_SCENES))}, got {builtin!r}"
+        )
+    path = Path(source)
+    if path.is_dir():
+        path = path / "scene.xml"
+    suffix = path.suffix.lower()
+    readers = {
+        ".xml": read_xml,
+        **dict.fromkeys(YAML_SUFFIXES, read_yaml),
+        **dict.fromkeys(MESH_SUFFIXES, read_mesh),
+    }
+    if suffix not in readers:
+        raise SceneError(
+            f"scene must be a {', '.join(sorted(readers))} file or one of "
+            f"{', '.join(sorted(BUILTIN_SCENES))}, got {str(source)!r}"
+        )
+    if not path.is_file():
+        raise SceneError(f"scene file must exist, got {str(source)!r}; check the path")
+    stem = path.resolve().parent.name if path.stem == "scene" else path.stem
+    return _slug(stem), readers[suffix](path)
+
+
+def _slug(text: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-") or "scene"
+
+
+def _digest(draft: SceneDraft, asked_depth: int | None) -> str:
+    content = {"version": DIGEST_VERSION, "content": draft.content, "max_depth": asked_depth}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _checked_depth(depth: int) -> int:
+    if depth < 1 and depth != -1:
+        raise SceneError(f"max_depth must be at least 1, or -1 for unlimited, got {depth}")
+    return depth
+
+
+def _float_property(node: Any, key: str) -> float | None:
+    return float(node.props[key]) if key in node.props else None
+
+
+def _clip_distances(scene: Any, camera: Camera, near: float | None, far: float | None) -> tuple[float, float]:
+    """The file's own clip distances, else ones that cut nothing that can be seen."""
+    centre, diagonal = bounds(scene)
+    reach = diagonal + float(np.linalg.norm(camera.origin - centre))
+    return (1e-4 * reach if near is None else near), (100.0 * reach if far is None else far)

@@ -1,0 +1,60 @@
+"""Checks of a built scene that Mitsuba does not make: finite vertices, area, content, light."""
+
+from typing import Any
+
+import numpy as np
+
+from workers.errors import SceneError
+
+
+def check_scene(scene: Any, what: str) -> list[str]:
+    """Look at every shape and the lights; returns notes.
+
+    Raises:
+        SceneError: no shape, no light, an empty mesh, vertices that are not finite, or a mesh without area.
+    """
+    shapes = scene.shapes()
+    if not shapes:
+        raise SceneError(f"{what} must hold at least one shape, got none; add geometry")
+    degenerate = sum(_check_mesh(shape, what) for shape in shapes if shape.is_mesh())
+    if not scene.emitters():
+        raise SceneError(
+            f"{what} must hold a light, got none; add an emitter (area, constant, envmap, point, ...)"
+        )
+    notes = []
+    if degenerate:
+        notes.append(f"{degenerate} triangles have no area: nothing is cached on them")
+    return notes
+
+
+def _check_mesh(mesh: Any, what: str) -> int:
+    """Check one mesh; returns its number of triangles without area."""
+    name = mesh.id() or mesh.class_name()
+    if mesh.face_count() == 0 or mesh.vertex_count() == 0:
+        raise SceneError(f"{what}: mesh {name} must have triangles, got none; remove it")
+    positions = np.array(mesh.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
+    faces = np.array(mesh.faces_buffer()).reshape(-1, 3)
+    if not np.isfinite(positions).all():
+        bad = int((~np.isfinite(positions).all(axis=1)).sum())
+        raise SceneError(
+            f"{what}: mesh {name} must have finite vertices, got {bad} with NaN or Inf; repair it"
+        )
+    if int(faces.max()) >= len(positions):
+        raise SceneError(
+            f"{what}: mesh {name} must index its {len(positions)} vertices, got {int(faces.max())}"
+        )
+    corners = positions[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    degenerate = int((np.linalg.norm(normals, axis=1) <= 0).sum())
+    if degenerate == len(faces):
+        raise SceneError(f"{what}: mesh {name} must have area, got {degenerate} triangles without; remove it")
+    return degenerate
+
+
+def bounds(scene: Any) -> tuple[np.ndarray, float]:
+    """Centre [3] and diagonal of the scene's bounding box, scene units."""
+    box = scene.bbox()
+    low, high = np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel()
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        return np.zeros(3), 1.0
+    return (low + high) / 2, float(np.linalg.norm(high - low)) or 1.0

@@ -1,0 +1,296 @@
+"""Every number that a run can choose, with presets; checked before any work starts."""
+
+import dataclasses
+import types
+import typing
+from dataclasses import dataclass, field
+from typing import Any, Literal, Self
+
+from workers.errors import WorkerError
+
+
+class SettingsError(WorkerError, ValueError):
+    """A setting has no such name or a value outside its range."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CacheSettings:
+    """Where caches sit, what they hold and what they cost.
+
+    Attributes:
+        elements: "lattice" (section `workers/lattice.py`), "vertex" (mesh vertices) or "triangle" (the paper's
+            barycentres).
+        lobes: "split" (diffuse as one number, the rest by direction, delta followed) or "exitant" (the paper's:
+            all of the exitant radiance by direction).
+        demodulate: divide the diffuse lobe by the reflectance at the element.
+        max_elements: budget of seen lattice elements; the lattice's spacing is solved from it.
+        min_spacing_px: no finer than this many pixels of the domain's cameras.
+        domain_poses: poses of the camera domain that decide what is seen.
+        diffuse_spp: paths per element for the diffuse lobe.
+        azimuth, polar: directions per element of the directional lobe.
+        directional_spp: paths per direction.
+        passes: equal slices of a unit's samples; between them a bake reports and can be cancelled.
+        elements_per_unit: cache elements in one unit of work (one chunk at rest).
+        max_edge_fraction: paper tessellation, longest edge allowed as a share of the scene's diagonal ("triangle",
+            "vertex"); 0 keeps the mesh.
+    """
+
+    elements: Literal["lattice", "vertex", "triangle"] = "lattice"
+    lobes: Literal["split", "exitant"] = "split"
+    demodulate: bool = True
+    max_elements: int = 60_000
+    min_spacing_px: float = 1.5
+    domain_poses: int = 40
+    diffuse_spp: int = 512
+    azimuth: int = 32
+    polar: int = 8
+    directional_spp: int = 8
+    passes: int = 1
+    elements_per_unit: int = 256
+    max_edge_fraction: float = 0.02
+
+
+@dataclass(frozen=True, kw_only=True)
+class QuerySettings:
+    """How caches become an image.
+
+    Attributes:
+        samples: primary rays per pixel along each axis: 1 or 2 (2x2).
+        weights: "barycentric", or "paper" (three rays a pixel, W = Wd Wn + 0.01).
+        scale_free: paper weights only: divide the distance by the primitive's size.
+        max_chain: delta bounces followed at most.
+    """
+
+    samples: int = 2
+    weights: Literal["barycentric", "paper", "single"] = "barycentric"
+    scale_free: bool = False
+    max_chain: int = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameSettings:
+    """Which frames are rendered as ground truth, and how well.
+
+    Attributes:
+        num_train, num_validation, num_test: frames of path A (train and validation) and of path B.
+        train_spp: paths per pixel of a training target.
+        denoise_train: Open Image Denoise (high) over the training targets.
+        test_spp: paths per pixel of a test reference.
+        denoise_test: "never", "always", or "capped" (only where its own noise would cap scores; said so).
+        passes: slices of a frame's samples.
+    """
+
+    num_train: int = 36
+    num_validation: int = 4
+    num_test: int = 6
+    train_spp: int = 64
+    denoise_train: bool = True
+    test_spp: int = 1024
+    denoise_test: Literal["never", "always", "capped"] = "capped"
+    reference_floor_db: float = 40.0
+    passes: int = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainSettings:
+    """Network and training.
+
+    Attributes:
+        widths: channels of the three scales.
+        fusion: "fuse" (the paper's block) or "concatenate" (ablation).
+        unshuffle: pixels folded into channels along each axis before the first layer (1: the paper).
+        residual: the network corrects the imperfect radiance instead of replacing it.
+        transfer: "mu_law" or "log1p" (the paper).
+        l1_weight, perceptual_weight, gradient_weight: terms of the loss.
+        epochs: passes over the training frames; `seconds` ends training earlier when above 0.
+        batch: crops per step.
+        crop: crop edge in pixels.
+        schedule: "paper" (x 0.95 per epoch) or "cosine" (one cycle with warm-up).
+        learning_rate: Adam's.
+        precision: "fp32", "bf16" or "auto" (measured).
+    """
+
+    widths: tuple[int, ...] = (32, 48, 64)
+    fusion: Literal["fuse", "concatenate"] = "fuse"
+    unshuffle: int = 2
+    residual: bool = True
+    transfer: Literal["mu_law", "log1p"] = "mu_law"
+    l1_weight: float = 1.0
+    perceptual_weight: float = 0.03
+    gradient_weight: float = 0.0
+    epochs: int = 400
+    seconds: float = 600.0
+    batch: int = 4
+    crop: int = 128
+    schedule: Literal["paper", "cosine"] = "cosine"
+    learning_rate: float = 1e-3
+    clip_norm: float = 1.0
+    precision: Literal["fp32", "bf16", "auto"] = "auto"
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationSettings:
+    """What is compared, and how often it is timed.
+
+    Attributes:
+        spp: path-traced adversaries.
+        qualities: Open Image Denoise qualities tried on each of them.
+        timing_repeats: timed frames per method, interleaved; the median counts.
+    """
+
+    spp: tuple[int, ...] = (1, 4, 16)
+    qualities: tuple[str, ...] = ("fast", "balanced", "high")
+    timing_repeats: int = 7
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """All settings of a run."""
+
+    preset: str = "balanced"
+    width: int = 512
+    height: int = 512
+    cache: CacheSettings = field(default_factory=CacheSettings)
+    query: QuerySettings = field(default_factory=QuerySettings)
+    frames: FrameSettings = field(default_factory=FrameSettings)
+    train: TrainSettings = field(default_factory=TrainSettings)
+    evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
+
+    @classmethod
+    def preset_named(cls, name: str) -> "Settings":
+        """Settings of a preset.
+
+        Raises:
+            SettingsError: no preset has that name.
+        """
+        if name not in _PRESETS:
+            raise SettingsError(f"preset must be one of {', '.join(_PRESETS)}, got {name!r}")
+        return Settings(preset=name).override(_PRESETS[name])
+
+    def override(self, values: dict[str, Any]) -> Self:
+        """A copy with dotted keys ("cache.diffuse_spp") set; strings are converted to the field's type.
+
+        Raises:
+            SettingsError: unknown key or a value that does not fit.
+        """
+        result = self
+        for key, value in values.items():
+            result = _set(result, key.split("."), value, key)
+        _check(result)
+        return result
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain nested dict."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_json(cls, value: dict[str, Any]) -> "Settings":
+        """Inverse of `to_json`."""
+        parts = {f.name: f.type for f in dataclasses.fields(cls)}
+        hints = typing.get_type_hints(cls)
+        arguments = {}
+        for name in parts:
+            item = value[name]
+            if isinstance(item, dict):
+                kind = hints[name]
+                item = kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in item.items()})
+            arguments[name] = item
+        return cls(**arguments)
+
+
+_PRESETS: dict[str, dict[str, Any]] = {
+    "draft": {},
+    "balanced": {
+        "cache.max_elements": 150_000, "cache.diffuse_spp": 1024, "cache.directional_spp": 16,
+        "frames.num_train": 72, "frames.num_validation": 8, "frames.num_test": 12, "frames.train_spp": 256,
+        "frames.test_spp": 4096, "train.seconds": 3600.0, "train.epochs": 1000,
+    },
+    "reference": {
+        "cache.max_elements": 400_000, "cache.diffuse_spp": 4096, "cache.azimuth": 64, "cache.polar": 16,
+        "cache.directional_spp": 32, "frames.num_train": 90, "frames.num_validation": 10, "frames.num_test": 200,
+        "frames.train_spp": 4000, "frames.denoise_train": False, "frames.test_spp": 4000,
+        "train.seconds": 0.0, "train.epochs": 1000, "train.widths": (48, 64, 96),
+    },
+    "demo": {
+        "width": 256, "height": 256, "cache.max_elements": 40_000, "cache.diffuse_spp": 256,
+        "frames.num_train": 24, "frames.num_validation": 3, "frames.num_test": 4, "frames.train_spp": 64,
+        "frames.test_spp": 512, "train.seconds": 200.0,
+    },
+    "tiny": {
+        "width": 64, "height": 64, "cache.max_elements": 1500, "cache.domain_poses": 4, "cache.diffuse_spp": 64,
+        "cache.azimuth": 8, "cache.polar": 4, "cache.directional_spp": 4, "frames.num_train": 4,
+        "frames.num_validation": 1, "frames.num_test": 2, "frames.train_spp": 32, "frames.test_spp": 64,
+        "frames.passes": 2, "train.epochs": 3, "train.seconds": 20.0, "train.batch": 2, "train.crop": 32,
+        "train.widths": (16, 16, 16), "evaluation.spp": (1,), "evaluation.timing_repeats": 2,
+    },
+}  # fmt: skip
+PRESETS = tuple(_PRESETS)
+
+
+def _set(node: Any, path: list[str], value: Any, key: str) -> Any:
+    names = {f.name for f in dataclasses.fields(node)}
+    name = path[0]
+    if name not in names:
+        raise SettingsError(f"setting {key!r} must name one of {', '.join(sorted(names))}, got {name!r}")
+    current = getattr(node, name)
+    if len(path) > 1:
+        if not dataclasses.is_dataclass(current):
+            raise SettingsError(f"setting {key!r} must not go below {name!r}, which is a single value")
+        return dataclasses.replace(node, **{name: _set(current, path[1:], value, key)})
+    if dataclasses.is_dataclass(current):
+        raise SettingsError(f"setting {key!r} must name a single value; use {key}.<name>")
+    kind = typing.get_type_hints(type(node))[name]
+    return dataclasses.replace(node, **{name: _convert(value, kind, key)})
+
+
+def _convert(value: Any, kind: Any, key: str) -> Any:
+    origin = typing.get_origin(kind)
+    try:
+        if origin is Literal:
+            if value not in typing.get_args(kind):
+                raise ValueError(f"one of {', '.join(map(str, typing.get_args(kind)))}")
+            return value
+        if origin is tuple:
+            items = value.split(",") if isinstance(value, str) else list(value)
+            return tuple(_convert(item, typing.get_args(kind)[0], key) for item in items)
+        if kind is bool:
+            return _boolean(value)
+        if isinstance(origin, types.UnionType) or kind is str:
+            return str(value)
+        return kind(value)
+    except (TypeError, ValueError) as error:
+        rule = str(error) if origin is Literal or kind is bool else f"of type {getattr(kind, '__name__', kind)}"
+        raise SettingsError(f"setting {key!r} must be {rule}, got {value!r}") from error
+
+
+def _boolean(value: Any) -> bool:
+    if isinstance(value, bool):
+        return value
+    words = {"true": True, "1": True, "yes": True, "false": False, "0": False, "no": False}
+    if str(value).lower() not in words:
+        raise ValueError("true or false")
+    return words[str(value).lower()]
+
+
+_POSITIVE = (
+    "width", "height", "cache.max_elements", "cache.min_spacing_px", "cache.domain_poses", "cache.diffuse_spp",
+    "cache.azimuth", "cache.polar", "cache.directional_spp", "cache.passes", "cache.elements_per_unit",
+    "frames.num_train", "frames.num_validation", "frames.num_test", "frames.train_spp", "frames.test_spp",
+    "frames.passes", "train.batch", "train.crop", "train.epochs", "train.learning_rate",
+    "evaluation.timing_repeats",
+)  # fmt: skip
+
+
+def _check(settings: Settings) -> None:
+    for key in _POSITIVE:
+        value: Any = settings
+        for name in key.split("."):
+            value = getattr(value, name)
+        if not value > 0:
+            raise SettingsError(f"setting {key!r} must be above 0, got {value}")
+    if settings.query.samples not in (1, 2, 3, 4):
+        raise SettingsError(f"setting 'query.samples' must be 1 to 4, got {settings.query.samples}")
+    if settings.train.unshuffle not in (1, 2, 4):
+        raise SettingsError(f"setting 'train.unshuffle' must be 1, 2 or 4, got {settings.train.unshuffle}")
+    if len(settings.train.widths) != 3:
+        raise SettingsError(f"setting 'train.widths' must be three channel counts, got {settings.train.widths}")

@@ -1,0 +1,337 @@
+"""Stage `train`: fits the reconstruction network of one scene; resumes exactly from its checkpoint."""
+
+import dataclasses
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from models.losses import LossConfig, ReconstructionLoss
+from models.metrics import exposure_from_luminance, luminance, psnr, tone_map
+from models.network import FusionNet, NetworkConfig
+from models.perceptual import StLpips
+from models.transfer import Transfer
+from storage.perceptual_weights import find_stlpips
+from storage.store import UnitRef
+from storage.weights import decode_checkpoint, decode_network, encode_checkpoint, encode_network
+from workers.errors import WorkerError
+from workers.inputs import load_inputs
+from workers.query import CHANNELS, NUM_CHANNELS
+from workers.reconstruct import GBUFFER_CHANNELS, Encoding
+from workers.render import load_render
+from workers.run_state import RunState
+from workers.schedule import learning_rate
+
+STAGE = "train"
+CHECKPOINT_STAGE = "checkpoint"
+WEIGHTS_FILE, CONFIG_FILE, CHECKPOINT_FILE = "network.safetensors", "network.json", "checkpoint.pt"
+CHECKPOINT_SECONDS = 60.0
+VALIDATIONS = 20
+PROBE_STEPS = 6
+
+
+@dataclass
+class Dataset:
+    """Frames in memory.
+
+    Attributes:
+        features: float32 [frames, height, width, NUM_CHANNELS].
+        target: linear radiance, float32 [frames, height, width, 3].
+    """
+
+    features: Tensor
+    target: Tensor
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+
+def train_ref(run: RunState, inputs: list[UnitRef], renders: list[UnitRef]) -> UnitRef:
+    """The unit that holds the trained network."""
+    params = {"train": dataclasses.asdict(run.settings.train), "inputs": [r.key for r in inputs],
+              "renders": [r.key for r in renders], "denoise": run.settings.frames.denoise_train}  # fmt: skip
+    return run.ref(STAGE, params)
+
+
+def load_dataset(run: RunState, inputs: list[UnitRef], renders: list[UnitRef]) -> Dataset:
+    """Reads input and target frames."""
+    layer = "denoised" if run.settings.frames.denoise_train else "radiance"
+    features, targets = [], []
+    for input_ref, render_ref in zip(inputs, renders, strict=True):
+        layers = load_inputs(run, input_ref)
+        height, width = layers["ir"].shape[:2]
+        frame = np.zeros((height, width, NUM_CHANNELS), np.float32)
+        for name, (a, b) in CHANNELS.items():
+            frame[..., a:b] = layers[name]
+        features.append(frame)
+        targets.append(load_render(run, render_ref)[layer])
+    return Dataset(torch.from_numpy(np.stack(features)), torch.from_numpy(np.stack(targets)))
+
+
+def run_train(run: RunState, train: tuple[list[UnitRef], list[UnitRef]],
+              validation: tuple[list[UnitRef], list[UnitRef]]) -> UnitRef:  # fmt: skip
+    """Trains unless the store has the network; both arguments are (input units, render units)."""
+    ref = train_ref(run, *train)
+    if run.store.committed(ref) is not None:
+        return ref
+    start = time.perf_counter()
+    trainer = Trainer(run, ref, load_dataset(run, *train), load_dataset(run, *validation) if validation[0] else None)
+    trainer.fit()
+    seconds = time.perf_counter() - start
+    weights, config = encode_network(trainer.best_state(), trainer.description())
+    record = {"seconds": seconds, "steps": trainer.step, "curve": trainer.curve, "non_finite_steps": trainer.skipped}
+    run.store.commit(ref, {WEIGHTS_FILE: weights, CONFIG_FILE: config}, record)
+    discard_checkpoints(run, ref)
+    run.seconds[STAGE] = seconds
+    return ref
+
+
+def load_network(run: RunState, ref: UnitRef) -> tuple[FusionNet, Encoding]:
+    """Reads a trained network."""
+    store = run.store
+    state, config = decode_network(store.read(ref, WEIGHTS_FILE), store.read(ref, CONFIG_FILE))
+    values = config["network"]
+    network = FusionNet(NetworkConfig(**{**values, "widths": tuple(values["widths"])}))
+    network.load_state_dict(state)
+    return network, Encoding.from_json(config["encoding"])
+
+
+class Trainer:
+    """Model, optimizer, schedule, random state and data cursor of one training run."""
+
+    def __init__(self, run: RunState, ref: UnitRef, train: Dataset, validation: Dataset | None) -> None:
+        self.run, self.ref, self.settings = run, ref, run.settings.train
+        self.train_set, self.validation_set = train, validation
+        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.encoding = _encoding(train, self.settings.transfer)
+        seed = run.seed(ref)
+        torch.manual_seed(seed)
+        self.config = NetworkConfig(
+            ir_channels=3, gbuffer_channels=GBUFFER_CHANNELS, widths=self.settings.widths,
+            fusion=self.settings.fusion, unshuffle=self.settings.unshuffle, residual=self.settings.residual,
+        )  # fmt: skip
+        self.network = FusionNet(self.config).to(self.device, memory_format=torch.channels_last)
+        self.optimizer = torch.optim.Adam(
+            self.network.parameters(), lr=self.settings.learning_rate, betas=(0.9, 0.999)
+        )
+        self.loss = self._loss()
+        self.rng = np.random.default_rng(seed)
+        self.step, self.num_steps, self.skipped = 0, 0, 0
+        self.curve: list[dict[str, float]] = []
+        self._best: dict[str, Tensor] | None = None
+        self._encode_sets()
+        self._resume()
+
+    # ------------------------------------------------ set-up ------------------------------------------------
+
+    def _loss(self) -> ReconstructionLoss:
+        settings = self.settings
+        perceptual = None
+        if settings.perceptual_weight > 0:
+            weights = find_stlpips()
+            if weights is None:
+                self.run.progress.message(
+                    "ST-LPIPS weights are not installed: training with L1 + multi-scale gradient instead "
+                    "(pip install --no-deps stlpips_pytorch)"
+                )
+            else:
+                perceptual = StLpips(weights["alex"] if "alex" in weights else weights["vgg"]).to(self.device)
+        gradient = settings.gradient_weight if settings.gradient_weight > 0 else None
+        config = LossConfig(l1=settings.l1_weight, perceptual=settings.perceptual_weight, gradient=gradient)
+        return ReconstructionLoss(config, transfer=self.encoding.transfer, perceptual=perceptual)
+
+    def _encode_sets(self) -> None:
+        """Frames in network space, kept channels-last."""
+        self.ir, self.gbuffer = self.encoding.inputs(self.train_set.features)
+        exposed = self.train_set.target * self.encoding.exposure
+        self.target = self.encoding.transfer.forward(exposed).permute(0, 3, 1, 2)
+
+    def _resume(self) -> None:
+        found = latest_checkpoint(self.run, self.ref)
+        if found is None:
+            return
+        state = decode_checkpoint(self.run.store.read(found, CHECKPOINT_FILE))
+        self.network.load_state_dict(state["network"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.rng.bit_generator.state = state["rng"]
+        torch.set_rng_state(state["torch_rng"])
+        self.step, self.num_steps, self.skipped = state["step"], state["num_steps"], state["skipped"]
+        self.curve, self._best = state["curve"], state["best"]
+
+    # ----------------------------------------------- training ----------------------------------------------
+
+    def fit(self) -> None:
+        """Runs the remaining steps."""
+        self.num_steps = self.num_steps or self._planned_steps()
+        every = max(1, self.num_steps // VALIDATIONS)
+        saved = time.perf_counter()
+        if self.step == 0:
+            self._validate()
+        with self.run.progress.track("train", self.num_steps) as advance:
+            advance(self.step)
+            while self.step < self.num_steps:
+                terms = self.train_step()
+                if self.step % every == 0 or self.step == self.num_steps:
+                    self._validate()
+                last = self.curve[-1].get("psnr")
+                advance(1, f"loss {terms['total']:.4f}" + (f", validation {last:.2f} dB" if last else ""))
+                if time.perf_counter() - saved > CHECKPOINT_SECONDS:
+                    self.save_checkpoint()
+                    saved = time.perf_counter()
+
+    def _planned_steps(self) -> int:
+        """Steps of all epochs, fewer where the time budget ends first (measured over a few steps, then fixed)."""
+        settings = self.settings
+        full = max(1, settings.epochs * max(1, -(-self._crops_per_epoch() // settings.batch)))
+        if settings.seconds <= 0:
+            return full
+        state = {k: v.clone() for k, v in self.network.state_dict().items()}
+        rng, optimizer = self.rng.bit_generator.state, self.optimizer.state_dict()
+        self.num_steps = full
+        times = []
+        for _ in range(min(PROBE_STEPS, full)):
+            start = time.perf_counter()
+            self.train_step()
+            times.append(time.perf_counter() - start)
+        self.network.load_state_dict(state)
+        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=settings.learning_rate, betas=(0.9, 0.999))
+        del optimizer
+        self.rng.bit_generator.state, self.step = rng, 0
+        return int(np.clip(settings.seconds / float(np.median(times)), 1, full))
+
+    def _crops_per_epoch(self) -> int:
+        """Crops that cover every training pixel once."""
+        height, width = self.target.shape[-2:]
+        return max(1, round(len(self.train_set) * height * width / self._crop_size() ** 2))
+
+    def _crop_size(self) -> int:
+        multiple = self.config.size_multiple
+        smallest = min(self.target.shape[-2:])
+        return max(multiple, min(self.settings.crop, smallest) // multiple * multiple)
+
+    def train_step(self) -> dict[str, float]:
+        """One optimizer step on random crops; returns the loss terms."""
+        ir, gbuffer, target = self._batch()
+        lr = learning_rate(self.settings, self.step, self.num_steps, self._steps_per_epoch())
+        for group in self.optimizer.param_groups:
+            group["lr"] = lr
+        self.optimizer.zero_grad(set_to_none=True)
+        output = self.network(ir, gbuffer)
+        terms = self.loss(output.float(), target)
+        terms["total"].backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.settings.clip_norm)
+        if torch.isfinite(norm):
+            self.optimizer.step()
+        else:
+            self.skipped += 1
+            if self.skipped > 0.05 * max(self.num_steps, 100):
+                raise WorkerError(
+                    f"training must have finite gradients, got {self.skipped} steps that have not; "
+                    "lower train.learning_rate"
+                )
+        self.step += 1
+        return {name: float(value.detach()) for name, value in terms.items()}
+
+    def _steps_per_epoch(self) -> int:
+        return max(1, -(-self._crops_per_epoch() // self.settings.batch))
+
+    def _batch(self) -> tuple[Tensor, Tensor, Tensor]:
+        size = self._crop_size()
+        height, width = self.target.shape[-2:]
+        parts: list[list[Tensor]] = [[], [], []]
+        for _ in range(self.settings.batch):
+            frame = int(self.rng.integers(len(self.train_set)))
+            y = int(self.rng.integers(height - size + 1)) if height >= size else 0
+            x = int(self.rng.integers(width - size + 1)) if width >= size else 0
+            for part, source in zip(parts, (self.ir, self.gbuffer, self.target), strict=True):
+                part.append(source[frame, :, y : y + size, x : x + size])
+        batch = [torch.stack(part).to(self.device, memory_format=torch.channels_last) for part in parts]
+        return batch[0], batch[1], batch[2]
+
+    # ---------------------------------------------- validation ---------------------------------------------
+
+    def _validate(self) -> None:
+        """Adds a point to the validation curve and keeps the best weights."""
+        point: dict[str, float] = {"step": float(self.step)}
+        data = self.validation_set
+        if data is not None:
+            point["psnr"] = float(np.mean([self._score(data, i) for i in range(len(data))]))
+            best = max((p["psnr"] for p in self.curve if "psnr" in p), default=-np.inf)
+            if point["psnr"] >= best:
+                self._best = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
+        self.curve.append(point)
+
+    @torch.no_grad()
+    def _score(self, data: Dataset, index: int) -> float:
+        multiple = self.config.size_multiple
+        height, width = (n // multiple * multiple for n in data.features.shape[1:3])
+        ir, gbuffer = self.encoding.inputs(data.features[index : index + 1, :height, :width])
+        output = self.network(ir.to(self.device), gbuffer.to(self.device))
+        frame = self.encoding.radiance(output)[0].permute(1, 2, 0).cpu().numpy()
+        reference = data.target[index, :height, :width].numpy()
+        exposure = self.encoding.exposure
+        return psnr(tone_map(frame, exposure), tone_map(reference, exposure))
+
+    # ---------------------------------------------- persistence --------------------------------------------
+
+    def best_state(self) -> dict[str, Tensor]:
+        """Weights with the best validation score, the last ones without validation."""
+        state = self._best if self._best is not None else self.network.state_dict()
+        return {name: value.detach().cpu().contiguous() for name, value in state.items()}
+
+    def description(self) -> dict[str, Any]:
+        """What a reader of the weights needs."""
+        return {"network": dataclasses.asdict(self.config), "encoding": self.encoding.to_json(),
+                "settings": dataclasses.asdict(self.settings), "curve": self.curve}  # fmt: skip
+
+    def save_checkpoint(self) -> None:
+        """Commits the state of this step and drops older checkpoints."""
+        params = {"train": self.ref.key, "step": self.step}
+        ref = self.run.ref(CHECKPOINT_STAGE, params)
+        state = {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict(),
+                 "rng": self.rng.bit_generator.state, "torch_rng": torch.get_rng_state(), "step": self.step,
+                 "num_steps": self.num_steps, "skipped": self.skipped, "curve": self.curve,
+                 "best": self._best}  # fmt: skip
+        older = checkpoints(self.run, self.ref)
+        self.run.store.commit(ref, {CHECKPOINT_FILE: encode_checkpoint(state)}, params)
+        for old in older:
+            if old != ref:
+                self.run.store.discard(old)
+
+
+def checkpoints(run: RunState, ref: UnitRef) -> list[UnitRef]:
+    """Checkpoints of a training run."""
+    found = []
+    for candidate in run.store.units(run.scene.digest, CHECKPOINT_STAGE):
+        record = run.store.committed(candidate)
+        if record is not None and record.get("train") == ref.key:
+            found.append(candidate)
+    return found
+
+
+def latest_checkpoint(run: RunState, ref: UnitRef) -> UnitRef | None:
+    """The checkpoint with the most steps."""
+
+    def step(candidate: UnitRef) -> int:
+        record = run.store.committed(candidate)
+        return int(record["step"]) if record else -1
+
+    return max(checkpoints(run, ref), key=step, default=None)
+
+
+def discard_checkpoints(run: RunState, ref: UnitRef) -> None:
+    """Drops what a finished run no longer needs."""
+    for candidate in checkpoints(run, ref):
+        run.store.discard(candidate)
+
+
+def _encoding(train: Dataset, curve: str) -> Encoding:
+    targets = train.target.numpy()
+    exposure = exposure_from_luminance([luminance(frame) for frame in targets])
+    a = CHANNELS["distance"][0]
+    farthest = float(train.features[..., a].max())
+    name = "log1p" if curve == "log1p" else "mu-law"
+    return Encoding(exposure, farthest if farthest > 0 else 1.0, Transfer(curve=name))

@@ -1,0 +1,125 @@
+"""What the camera domain sees: non-delta surface hits of every pose, with the size of a pixel there.
+
+The domain is the volume that `camera_path.domain_poses` states: the training path and jittered poses around it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from workers.backend import dr, mi
+from workers.camera import Camera
+from workers.lobes import LobeClass, has
+from workers.primary import DeviceCamera, delta_lobes, dominant_lobe
+from workers.progress import Progress
+from workers.surfaces import SurfaceTable
+
+MAX_CHAIN = 8
+MIN_PROBABILITY = 0.02
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Hits of the domain on cached surfaces.
+
+    Attributes:
+        prim: global primitive, int64 [n].
+        uv: barycentrics or surface parameters, float32 [n, 2].
+        side: 0 the side of the geometric normal, 1 the other; uint8 [n].
+        footprint: edge of a pixel at the hit in scene units, float32 [n].
+    """
+
+    prim: np.ndarray
+    uv: np.ndarray
+    side: np.ndarray
+    footprint: np.ndarray
+
+
+def domain_hits(
+    mi_scene: "mi.Scene",
+    table: SurfaceTable,
+    poses: list[Camera],
+    target_width: int,
+    rays_per_pose: int,
+    progress: Progress,
+) -> Hits:
+    """Traces every pose of the domain, through delta surfaces (both lobes at the first one).
+
+    Args:
+        mi_scene: the scene.
+        table: its surfaces.
+        poses: cameras of the domain.
+        target_width: image width in pixels for which footprints are stated.
+        rays_per_pose: about how many rays a pose casts.
+        progress: told pose by pose.
+    """
+    collected: list[Hits] = []
+    with progress.track("visibility", len(poses)) as advance:
+        for index, pose in enumerate(poses):
+            collected += _pose_hits(mi_scene, table, pose, target_width, rays_per_pose, index)
+            advance()
+    names = ("prim", "uv", "side", "footprint")
+    return Hits(*(np.concatenate([getattr(h, name) for h in collected]) for name in names))
+
+
+def _pose_hits(
+    mi_scene: "mi.Scene", table: SurfaceTable, pose: Camera, target_width: int, rays: int, index: int
+) -> list[Hits]:
+    scale = np.sqrt(rays / (pose.width * pose.height))
+    width, height = max(1, round(pose.width * scale)), max(1, round(pose.height * scale))
+    lane = dr.arange(mi.UInt32, width * height)
+    rng = mi.PCG32(width * height, initstate=dr.opaque(mi.UInt64, index), initseq=mi.UInt64(lane))
+    x, y = lane % width, lane // width
+    ray = DeviceCamera.upload(pose).ray(x + rng.next_float32(), y + rng.next_float32(), width, height)
+    pixel = dr.opaque(mi.Float, 2 * np.tan(np.radians(pose.fov_deg) / 2) / target_width)
+    delta = bool(table.lobe_union & LobeClass.DELTA)
+    active, travelled = dr.full(mi.Bool, True, width * height), dr.zeros(mi.Float, width * height)
+    queue = [(ray, active, travelled, 0)]
+    found = []
+    while queue:
+        ray, active, travelled, depth = queue.pop()
+        pi = mi_scene.ray_intersect_preliminary(ray, coherent=depth == 0, active=active)
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        active = active & si.is_valid()
+        travelled = travelled + dr.select(active, si.t, 0.0)
+        found.append(_read_hits(table, pi, si, active, travelled * pixel, ray))
+        if delta and depth < MAX_CHAIN:
+            queue += _next_rays(table, si, active, travelled, depth)
+    return found
+
+
+def _read_hits(table, pi, si, active, footprint, ray) -> Hits:  # type: ignore[no-untyped-def]
+    shape = table.shape_index(si, active)
+    bits = dr.gather(mi.UInt32, table.lobe_bits_dr, shape, active)
+    cached = active & (has(bits, LobeClass.DIFFUSE) | has(bits, LobeClass.GLOSSY))
+    parametric = dr.gather(mi.Bool, mi.Bool(table.is_parametric), shape, active)
+    uv = dr.select(parametric, si.uv, pi.prim_uv)
+    prim = dr.gather(mi.UInt32, table.prim_offset_dr, shape, active) + dr.select(parametric, 0, pi.prim_index)
+    side = dr.select(dr.dot(si.n, ray.d) > 0, mi.UInt32(1), mi.UInt32(0))
+    dr.eval(cached, prim, uv, side, footprint)
+    keep = cached.numpy().astype(bool)
+    return Hits(
+        prim.numpy()[keep].astype(np.int64),
+        uv.numpy().T[keep].astype(np.float32),
+        side.numpy()[keep].astype(np.uint8),
+        footprint.numpy()[keep].astype(np.float32),
+    )
+
+
+def _next_rays(table, si, active, travelled, depth):  # type: ignore[no-untyped-def]
+    shape = table.shape_index(si, active)
+    bits = dr.gather(mi.UInt32, table.lobe_bits_dr, shape, active)
+    active = active & has(bits, LobeClass.DELTA)
+    if not dr.any(active):
+        return []
+    a, b = delta_lobes(si.bsdf(), si, active)
+    if depth == 0:
+        options = [(lobe.wo, lobe.valid & (lobe.pdf * dr.max(lobe.weight) > MIN_PROBABILITY)) for lobe in (a, b)]
+    else:
+        wo, _, valid = dominant_lobe(a, b)
+        options = [(wo, valid)]
+    rays = []
+    for wo, valid in options:
+        if dr.any(valid):
+            rays.append((si.spawn_ray(si.to_world(wo)), valid, travelled, depth + 1))
+    return rays
