@@ -43,6 +43,7 @@ ReportOption = Annotated[
 PictureOption = Annotated[
     Path | None, typer.Option("--picture", help="also write the first pictures as one PNG")
 ]
+BENCHMARKS_PAGE = Path("docs/benchmarks.md")
 
 
 def _load(scene: str, resolution: str | None) -> "Scene":
@@ -154,6 +155,75 @@ def evaluate(
         with RichProgress() as progress:
             evaluation = evaluate_scene(loaded, opened, settings, progress)
         finish(evaluation, store, outputs)
+
+
+@app.command()
+def ablate(
+    scene: SceneArgument,
+    store: StoreOption,
+    preset: PresetOption = "draft",
+    resolution: ResolutionOption = None,
+    assignments: SetOption = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Train and measure the paper's choices and ours, one change at a time. Hours on a real scene."""
+    with reported():
+        outputs = Outputs(json=json_file)
+        from service.ablations import ablation_table, measure_ablation
+        from service.benchmarks import json_bytes, shown_command, shown_path
+        from service.options import write_file
+        from service.progress import RichProgress
+        from service.table import show
+        from storage.store import Store
+
+        loaded = _load(scene, resolution)
+        settings = _settings(preset, loaded, assignments)
+        command = shown_command(["ablate", shown_path(scene)], store, preset, resolution, assignments or [])
+        with RichProgress() as progress:
+            ablation = measure_ablation(loaded, Store.open(store, create=True), settings, progress, command)
+        show(ablation_table(ablation))
+        if outputs.json is not None:
+            write_file(outputs.json, json_bytes(ablation))
+
+
+@app.command()
+def benchmark(
+    store: StoreOption,
+    output: Annotated[Path, typer.Option("--output", "-o", help="the Markdown page")] = BENCHMARKS_PAGE,
+    scenes: Annotated[
+        list[str] | None,
+        typer.Option("--scene", help="measure this scene; may be given again; none: only write the page"),
+    ] = None,
+    preset: PresetOption = "draft",
+    resolution: ResolutionOption = "256x256",
+    assignments: SetOption = None,
+    size: Annotated[
+        str, typer.Option("--size", help="WIDTHxHEIGHT of the frame that is timed")
+    ] = "1920x1080",
+    repeats: Annotated[int, typer.Option("--repeats", min=1, help="timed rounds; medians count")] = 7,
+    with_ablation: Annotated[bool, typer.Option("--ablate", help="also run the ablation (hours)")] = False,
+) -> None:
+    """Measure scenes, keep the results in the store, and write the page of all scenes measured so far."""
+    with reported():
+        check_writable(output, "--output")
+        from service.benchmarks import BenchmarkRequest, measure, write_page
+        from service.progress import RichProgress
+        from storage.store import Store
+
+        opened = Store.open(store, create=bool(scenes))
+        frame_size = parse_size(size)
+        for source in scenes or []:
+            request = BenchmarkRequest(
+                source=source, store_url=store, preset=preset, resolution=resolution,
+                assignments=tuple(assignments or ()), size=frame_size, repeats=repeats, ablate=with_ablation,
+            )  # fmt: skip
+            loaded = _load(source, resolution)
+            settings = _settings(preset, loaded, assignments)
+            with RichProgress() as progress:
+                evaluation = measure(loaded, opened, settings, request, progress)
+            finish(evaluation, store, Outputs())
+            write_page(opened, output)
+        print(f"{output}: measured scenes: {write_page(opened, output)}")
 
 
 @app.command()

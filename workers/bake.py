@@ -12,6 +12,7 @@ import numpy as np
 
 from storage.caches import ArraySpec, CacheSet
 from storage.store import UnitRef
+from workers.cache_filter import filter_diffuse, filter_directional
 from workers.bake_kernels import Batch, bake_diffuse, bake_directional
 from workers.element_stage import elements_ref
 from workers.elements import ElementSet
@@ -162,6 +163,12 @@ def load_caches(run: RunState, elements: ElementSet) -> CacheArrays:
     empty = np.zeros((0, cache.polar, cache.azimuth, 3), np.float32)
     directional = loaded["directional"]["mean"] if "directional" in loaded else empty
     exitant = cache.lobes == "exitant"
+    if cache.denoise and not exitant:
+        directional = filter_directional(elements, directional)
+        if "diffuse" in loaded:
+            square = loaded["diffuse"]["square"]
+            variance = np.maximum(square - diffuse**2, 0.0) / max(cache.diffuse_spp - 1, 1)
+            diffuse = filter_diffuse(elements, diffuse, np.sqrt(variance))
     if not cache.demodulate and not exitant:
         diffuse = diffuse * reflectance_at(run.table, elements)
     return CacheArrays(diffuse, directional, demodulated=cache.demodulate, exitant=exitant)

@@ -46,7 +46,8 @@ def _streams(batch: Batch, lanes_per_element: int, bake_pass: int) -> "mi.PCG32"
     low = mi.UInt32(place * lanes_per_element + within)
     high = mi.UInt32(seed) + dr.opaque(mi.UInt32, (bake_pass * 0x9E3779B9) & 0xFFFFFFFF)
     v0, v1 = mi.sample_tea_32(high, low, 6)
-    return mi.PCG32(n * lanes_per_element, initstate=mi.UInt64(v0), initseq=mi.UInt64(v1))
+    # With a size, PCG32 adds the lane's place in the launch to its stream: grouping would change the result.
+    return mi.PCG32(1, initstate=mi.UInt64(v0), initseq=mi.UInt64(v1))
 
 
 def _interactions(

@@ -1,8 +1,8 @@
 """Cache elements: the lattice points that the camera domain sees, merged where they fall together.
 
 `build_elements` turns visible hits and a budget into patches (`workers/lattice.py`), picks the points that at
-least one hit interpolates, and lays down, for every lattice point and side, the slot of the element that answers
-for it: its own, or the nearest baked one where it was not seen.
+least one hit interpolates, and lays down, for every lattice point and side, the slot of the element that
+answers for it: its own, or the nearest baked one where it was not seen.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from workers.backend import dr, mi
+from workers.backend import dr
 from workers.lattice import (
     PatchTable,
     build_patch_table,
@@ -31,6 +31,8 @@ NO_SLOT = np.uint32(0xFFFFFFFF)
 MERGE_VOXEL = 0.45  # of the spacing
 SPACING_STEPS = 10
 NORMAL_BINS = 4
+HASH_MULTIPLIER = np.uint64(0x9E3779B97F4A7C15)
+LEAF_SIZE = 32  # of the search tree; larger than the default: queries in six dimensions visit many leaves
 
 
 @dataclass(frozen=True)
@@ -47,9 +49,9 @@ class ElementSet:
         normal: unit shading normal towards `side`, float32 [n, 3].
         footprint: pixel edge at the element in scene units, float32 [n] (inf where never seen).
         glossy: indices (into the above) of the elements with a directional lobe, int64 [g].
-        diffuse_slot, glossy_slot: uint32 [2 * num_points], by lattice point * 2 + side; a slot into all elements
-            or into `glossy`, `NOT_BAKED` set where it stands in for a neighbour, `NO_SLOT` where the lobe does
-            not occur in the scene.
+        diffuse_slot, glossy_slot: uint32 [2 * num_points], by lattice point * 2 + side; a slot into all
+            elements or into `glossy`, `NOT_BAKED` set where it stands in for a neighbour (for any element
+            where the material lacks the lobe), `NO_SLOT` where the lobe does not occur in the scene.
         spacing_px: the spacing that met the budget.
     """
 
@@ -91,16 +93,16 @@ def _solve_spacing(table: SurfaceTable, hits: Hits, settings: CacheSettings) -> 
         return _plain_lattice(table, hits, 1 if settings.elements == "vertex" else 0), 0.0
     prim_footprint = np.full(table.num_prims, np.inf, np.float32)
     np.minimum.at(prim_footprint, hits.prim, hits.footprint)
-    m = patch_counts(table.prim_edge, prim_footprint)
-    located = _patches_of_hits(table, hits, m)
+    located = _LocatedHits.of(table, hits, patch_counts(table.prim_edge, prim_footprint))
     low, high = settings.min_spacing_px, 256.0
-    best = _lattice_at(table, hits, m, located, low)
-    if len(_merged(table, best, settings)) <= settings.max_elements:
+    best = located.lattice(low)
+    if _fits(table, best, settings):
         return best, low
+    best = located.lattice(high)
     for _ in range(SPACING_STEPS):
         middle = float(np.sqrt(low * high))
-        lattice = _lattice_at(table, hits, m, located, middle)
-        if len(_merged(table, lattice, settings)) <= settings.max_elements:
+        lattice = located.lattice(middle)
+        if _fits(table, lattice, settings):
             high, best = middle, lattice
         else:
             low = middle
@@ -109,31 +111,66 @@ def _solve_spacing(table: SurfaceTable, hits: Hits, settings: CacheSettings) -> 
     return best, high
 
 
-def _patches_of_hits(table: SurfaceTable, hits: Hits, m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    square = _prim_is_square(table)
-    base = np.concatenate([[0], np.cumsum(patches_per_prim(m, square))])[:-1]
-    cell, b1, b2 = locate_patch(hits.uv[:, 0], hits.uv[:, 1], m[hits.prim], square[hits.prim])
-    return base[hits.prim] + cell, b1, b2
+def _fits(table: SurfaceTable, lattice: _Lattice, settings: CacheSettings) -> bool:
+    """Whether the merged elements are within the budget."""
+    if len(lattice.touched) <= settings.max_elements:
+        return True
+    return _count_distinct(_Points.of(table, lattice, settings).merge_key) <= settings.max_elements
 
 
-def _lattice_at(table: SurfaceTable, hits: Hits, m: np.ndarray, located, spacing: float) -> _Lattice:  # type: ignore[no-untyped-def]
-    patch, b1, b2 = located
-    square = _prim_is_square(table)
-    counts = patches_per_prim(m, square)
-    footprint = np.full(int(counts.sum()), np.inf, np.float32)
-    np.minimum.at(footprint, patch, hits.footprint)
-    edge = np.repeat(table.prim_edge / m, counts)
-    patches = build_patch_table(m, patch_levels(edge, footprint, spacing), square)
-    return _Lattice(patches, _touched(patches, patch, b1, b2, hits.side))
+def _distinct(values: np.ndarray) -> np.ndarray:
+    """`np.unique` of a vector by sorting, which beats its hash table several times over."""
+    ordered = np.sort(values)
+    return ordered[np.append(True, ordered[1:] != ordered[:-1])] if len(ordered) else ordered
+
+
+def _count_distinct(rows: np.ndarray) -> int:
+    """Number of distinct rows of an int64 matrix, by a 64-bit hash: many times faster than sorting rows."""
+    digest = np.zeros(len(rows), np.uint64)
+    for column in rows.T:
+        digest = (digest ^ column.astype(np.uint64)) * HASH_MULTIPLIER
+        digest ^= digest >> np.uint64(29)
+    return len(_distinct(digest))
+
+
+@dataclass(frozen=True)
+class _LocatedHits:
+    """Hits in their patches, and what the levels of patches depend on besides the spacing."""
+
+    square: np.ndarray
+    m: np.ndarray
+    patch: np.ndarray
+    b1: np.ndarray
+    b2: np.ndarray
+    side: np.ndarray
+    patch_footprint: np.ndarray
+    patch_edge: np.ndarray
+
+    @classmethod
+    def of(cls, table: SurfaceTable, hits: Hits, m: np.ndarray) -> "_LocatedHits":
+        square = _prim_is_square(table)
+        counts = patches_per_prim(m, square)
+        base = np.concatenate([[0], np.cumsum(counts)])
+        cell, b1, b2 = locate_patch(hits.uv[:, 0], hits.uv[:, 1], m[hits.prim], square[hits.prim])
+        patch = base[hits.prim] + cell
+        footprint = np.full(int(base[-1]), np.inf, np.float32)
+        np.minimum.at(footprint, patch, hits.footprint)
+        edge = np.repeat(table.prim_edge / m, counts)
+        return cls(square, m, patch, b1, b2, hits.side, footprint, edge)
+
+    def lattice(self, spacing_px: float) -> _Lattice:
+        """The lattice with points `spacing_px` apart where patches are seen."""
+        return self.with_levels(patch_levels(self.patch_edge, self.patch_footprint, spacing_px))
+
+    def with_levels(self, level: np.ndarray) -> _Lattice:
+        """The lattice with given levels of all patches."""
+        patches = build_patch_table(self.m, level, self.square)
+        return _Lattice(patches, _touched(patches, self.patch, self.b1, self.b2, self.side))
 
 
 def _plain_lattice(table: SurfaceTable, hits: Hits, level: int) -> _Lattice:
-    m = np.ones(table.num_prims, np.uint32)
-    square = _prim_is_square(table)
-    count = int(patches_per_prim(m, square).sum())
-    patches = build_patch_table(m, np.full(count, level, np.uint32), square)
-    patch, b1, b2 = _patches_of_hits(table, hits, m)
-    return _Lattice(patches, _touched(patches, patch, b1, b2, hits.side))
+    located = _LocatedHits.of(table, hits, np.ones(table.num_prims, np.uint32))
+    return located.with_levels(np.full(len(located.patch_edge), level, np.uint32))
 
 
 def _touched(
@@ -141,16 +178,12 @@ def _touched(
 ) -> np.ndarray:
     index, weight = locate_points(b1, b2, patches.patch_level[patch])
     point = (patches.patch_base[patch][:, None] + index) * 2 + side[:, None]
-    return np.unique(point[weight > 0])
+    return _distinct(point[weight > 0])
 
 
 def _prim_is_square(table: SurfaceTable) -> np.ndarray:
     counts = np.diff(table.prim_offset)
     return np.repeat(table.is_parametric, counts)
-
-
-def _merged(table: SurfaceTable, lattice: _Lattice, settings: CacheSettings) -> np.ndarray:
-    return np.unique(_Points.of(table, lattice, settings).merge_key, axis=0)
 
 
 @dataclass(frozen=True)
@@ -168,14 +201,19 @@ class _Points:
     @classmethod
     def of(cls, table: SurfaceTable, lattice: _Lattice, settings: CacheSettings) -> "_Points":
         point, side = lattice.touched // 2, (lattice.touched % 2).astype(np.uint8)
-        prim, uv_all = point_parameters(lattice.patches)
-        prim, uv = prim[point], uv_all[point].astype(np.float32)
+        prim, uv = _parameters_of(lattice.patches, point)
         shape = np.searchsorted(table.prim_offset, prim, side="right") - 1
         prim_local = prim - table.prim_offset[shape]
         position, normal, geometric = surface_frame(table, shape, prim_local, uv, side)
         spacing = _point_spacing(table, lattice, point, prim)
         key = _merge_key(shape, side, position, geometric, spacing, settings)
         return cls(shape, prim_local, uv, side, position, normal, key)
+
+
+def _parameters_of(patches: PatchTable, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`lattice.point_parameters` of some points: primitive, int64 [n], and its (u, v), float32 [n, 2]."""
+    prim, uv = point_parameters(patches)
+    return prim[point], uv[point].astype(np.float32)
 
 
 def surface_frame(
@@ -227,11 +265,11 @@ def _assemble(
     rank[order] = np.arange(len(order))
     chosen = representative[order]
     element = rank[element]
-    lobes = np.array([int(lobe) for lobe in table.lobes])[points.shape[chosen]]
+    lobes = np.array([int(lobe) for lobe in table.lobes])
     exitant = settings.lobes == "exitant"
-    is_glossy = np.full(len(chosen), True) if exitant else (lobes & int(LobeClass.GLOSSY)) > 0
-    is_diffuse = np.full(len(chosen), False) if exitant else (lobes & int(LobeClass.DIFFUSE)) > 0
-    glossy = np.flatnonzero(is_glossy)
+    glossy_shape = exitant | ((lobes & int(LobeClass.GLOSSY)) > 0)
+    diffuse_shape = ~np.bool_(exitant) & ((lobes & int(LobeClass.DIFFUSE)) > 0)
+    glossy = np.flatnonzero(glossy_shape[points.shape[chosen]])
     glossy_rank = np.full(len(chosen), -1, np.int64)
     glossy_rank[glossy] = np.arange(len(glossy))
     slots = _Slots(table, lattice, points, element, chosen)
@@ -244,8 +282,10 @@ def _assemble(
         position=points.position[chosen],
         normal=points.normal[chosen],
         glossy=glossy,
-        diffuse_slot=slots.fill(np.where(is_diffuse, np.arange(len(chosen)), -1)),
-        glossy_slot=slots.fill(glossy_rank),
+        diffuse_slot=slots.fill(
+            np.where(diffuse_shape[points.shape[chosen]], np.arange(len(chosen)), -1), diffuse_shape
+        ),
+        glossy_slot=slots.fill(glossy_rank, glossy_shape),
         spacing_px=spacing,
     )
 
@@ -273,7 +313,8 @@ class _Slots:
     element: np.ndarray
     chosen: np.ndarray
 
-    def fill(self, slot_of_element: np.ndarray) -> np.ndarray:
+    def fill(self, slot_of_element: np.ndarray, has_lobe: np.ndarray) -> np.ndarray:
+        """Slots of one lobe, from the slot of each element (-1: none) and whether each shape has the lobe."""
         num = self.lattice.patches.num_points * 2
         slots = np.full(num, NO_SLOT, np.uint32)
         own = slot_of_element[self.element]
@@ -282,20 +323,56 @@ class _Slots:
         candidates = np.flatnonzero(slot_of_element >= 0)
         if len(candidates) == 0:
             return slots
-        missing = np.flatnonzero(slots == NO_SLOT)
-        slots[missing] = slot_of_element[candidates[self._nearest(candidates, missing)]].astype(np.uint32) | NOT_BAKED
+        used = np.repeat(has_lobe[self._shape_of_patch()], np.diff(self.lattice.patches.patch_base))
+        missing = slots == NO_SLOT
+        slots[missing] = np.uint32(slot_of_element[candidates[0]]) | NOT_BAKED
+        missing = np.flatnonzero(missing & np.repeat(used, 2))
+        if len(missing) == 0:
+            return slots
+        asking, answer = self._askers(missing)
+        nearest = self._nearest(candidates, asking)[answer]
+        slots[missing] = slot_of_element[candidates[nearest]].astype(np.uint32) | NOT_BAKED
         return slots
 
-    def _nearest(self, candidates: np.ndarray, missing: np.ndarray) -> np.ndarray:
-        """Nearest candidate of each missing (point, side): place and normal count, then the shape."""
-        prim, uv_all = point_parameters(self.lattice.patches)
-        prim, uv = prim[missing // 2], uv_all[missing // 2].astype(np.float32)
+    def _shape_of_patch(self) -> np.ndarray:
+        per_prim = patches_per_prim(self.lattice.patches.prim_patches, self.lattice.patches.prim_is_square)
+        prim = np.repeat(np.arange(len(per_prim)), per_prim)
+        return np.searchsorted(self.table.prim_offset, prim, side="right") - 1
+
+    def _askers(self, missing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(the points to look for, which of them answers for each of `missing`).
+
+        The side of a patch that no hit touched is one question, asked at its middle point: most of all points
+        are there (backs of walls), and their searches are the longest.
+        """
+        patches = self.lattice.patches
+        seen = np.zeros(2 * patches.num_patches, bool)
+        seen[_patch_side(patches, self.lattice.touched)] = True
+        face = _patch_side(patches, missing)
+        order = np.argsort(face, kind="stable")
+        first = np.concatenate([[True], np.diff(face[order]) > 0]) | seen[face[order]]
+        group = np.cumsum(first) - 1
+        start = np.flatnonzero(first)
+        middle = (start + np.append(start[1:], len(missing)) - 1) // 2
+        answer = np.empty(len(missing), np.int64)
+        answer[order] = group
+        return missing[order[middle]], answer
+
+    def _nearest(self, candidates: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        """Nearest candidate of each wanted (point, side): place and normal count."""
+        prim, uv = _parameters_of(self.lattice.patches, wanted // 2)
         shape = np.searchsorted(self.table.prim_offset, prim, side="right") - 1
-        side = (missing % 2).astype(np.uint8)
+        side = (wanted % 2).astype(np.uint8)
         local = prim - self.table.prim_offset[shape]
         position, normal, _ = surface_frame(self.table, shape, local, uv, side)
         known = self.points.position[self.chosen][candidates]
         scale = max(float(np.ptp(known, axis=0).max()), 1e-30) * 0.1
-        tree = cKDTree(np.concatenate([known, self.points.normal[self.chosen][candidates] * scale], axis=1))
-        _, nearest = tree.query(np.nan_to_num(np.concatenate([position, normal * scale], axis=1)), workers=2)
-        return nearest
+        places = np.concatenate([known, self.points.normal[self.chosen][candidates] * scale], axis=1)
+        asked = np.nan_to_num(np.concatenate([position, normal * scale], axis=1))
+        return cKDTree(places, leafsize=LEAF_SIZE).query(asked, workers=-1)[1]
+
+
+def _patch_side(patches: PatchTable, point_side: np.ndarray) -> np.ndarray:
+    """patch * 2 + side of (point * 2 + side)."""
+    patch = np.searchsorted(patches.patch_base, point_side // 2, side="right") - 1
+    return patch * 2 + point_side % 2

@@ -21,7 +21,7 @@ def inputs_ref(run: RunState, elements: ElementSet, camera: Camera) -> UnitRef:
     """The unit that holds a pose's network inputs."""
     caches = {name: ref.key for name, ref in bake_refs(run, elements).items()}
     params = {"camera": camera_params(camera), "caches": caches, "query": dataclasses.asdict(run.settings.query),
-              "demodulate": run.settings.cache.demodulate}  # fmt: skip
+              "demodulate": run.settings.cache.demodulate, "denoise": run.settings.cache.denoise}  # fmt: skip
     return run.ref(STAGE, params)
 
 

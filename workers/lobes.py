@@ -106,9 +106,11 @@ def diffuse_reflectance(
         result = dr.select(masked, value * (dr.pi / PROBE_COSINE), result)
     if union & LobeClass.PRINCIPLED:
         principled = active & has(bits, LobeClass.PRINCIPLED)
-        principled &= (si.wi.z > 0) | ~has(bits, LobeClass.FRONT_ONLY)
         base, metallic, transmission = principled_parameters(bsdf, si, principled)
-        result = dr.select(principled, base * (1 - metallic) * (1 - transmission), result)
+        # Not in the mask above: with a narrower mask here, the same call in `specular_tint` read zeros where they
+        # share a kernel (Mitsuba 3.9.1).
+        reflects = (si.wi.z > 0) | ~has(bits, LobeClass.FRONT_ONLY)
+        result = dr.select(principled & reflects, base * (1 - metallic) * (1 - transmission), result)
     return result
 
 

@@ -114,9 +114,8 @@ def _evaluate(
     start = time.perf_counter()
     torch.set_num_threads(dr.thread_count())
     network, encoding = load_network(run, network_ref)
-    renderer = FrameRenderer(
-        program, Reconstructor(network, encoding, precision=run.settings.train.precision, compile=True)
-    )
+    precision, compile_ = run.settings.train.precision, run.settings.evaluation.compile
+    renderer = FrameRenderer(program, Reconstructor(network, encoding, precision=precision, compile=compile_))
     sizes = {"cache": cache_nbytes(run, elements), "network": len(run.store.read(network_ref, WEIGHTS_FILE))}
     evaluation = run_evaluation(run, renderer, test_refs, stage_seconds(run, elements, network_ref), sizes)
     run.seconds["evaluate"] = time.perf_counter() - start

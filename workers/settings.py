@@ -23,6 +23,7 @@ class CacheSettings:
         lobes: "split" (diffuse as one number, the rest by direction, delta followed) or "exitant" (the paper's:
             all of the exitant radiance by direction).
         demodulate: divide the diffuse lobe by the reflectance at the element.
+        denoise: average neighbouring elements, guarded by their variance (`workers/cache_filter.py`).
         max_elements: budget of seen lattice elements; the lattice's spacing is solved from it.
         min_spacing_px: no finer than this many pixels of the domain's cameras.
         domain_poses: poses of the camera domain that decide what is seen.
@@ -38,6 +39,7 @@ class CacheSettings:
     elements: Literal["lattice", "vertex", "triangle"] = "lattice"
     lobes: Literal["split", "exitant"] = "split"
     demodulate: bool = True
+    denoise: bool = True
     max_elements: int = 60_000
     min_spacing_px: float = 1.5
     domain_poses: int = 40
@@ -136,11 +138,13 @@ class EvaluationSettings:
         spp: path-traced adversaries.
         qualities: Open Image Denoise qualities tried on each of them.
         timing_repeats: timed frames per method, interleaved; the median counts.
+        compile: try a compiled network (tens of seconds once a frame size) and keep it where it is faster.
     """
 
     spp: tuple[int, ...] = (1, 4, 16)
     qualities: tuple[str, ...] = ("fast", "balanced", "high")
     timing_repeats: int = 7
+    compile: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,6 +226,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "frames.num_validation": 1, "frames.num_test": 2, "frames.train_spp": 32, "frames.test_spp": 64,
         "frames.passes": 2, "train.epochs": 3, "train.seconds": 20.0, "train.batch": 2, "train.crop": 32,
         "train.widths": (16, 16, 16), "evaluation.spp": (1,), "evaluation.timing_repeats": 2,
+        "evaluation.compile": False,
     },
 }  # fmt: skip
 PRESETS = tuple(_PRESETS)

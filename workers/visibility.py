@@ -1,6 +1,7 @@
 """What the camera domain sees: non-delta surface hits of every pose, with the size of a pixel there.
 
-The domain is the volume that `camera_path.domain_poses` states: the training path and jittered poses around it.
+The domain is the volume that `camera_path.domain_poses` states: the training path and jittered poses around
+it.
 """
 
 from dataclasses import dataclass
@@ -72,31 +73,41 @@ def _pose_hits(
     x, y = lane % width, lane // width
     ray = DeviceCamera.upload(pose).ray(x + rng.next_float32(), y + rng.next_float32(), width, height)
     pixel = dr.opaque(mi.Float, 2 * np.tan(np.radians(pose.fov_deg) / 2) / target_width)
-    delta = bool(table.lobe_union & LobeClass.DELTA)
-    active, travelled = dr.full(mi.Bool, True, width * height), dr.zeros(mi.Float, width * height)
-    queue = [(ray, active, travelled, 0)]
+    follows = bool(table.lobe_union & LobeClass.DELTA)
+    waves = [(ray, dr.zeros(mi.Float, width * height), 0)]
     found = []
-    while queue:
-        ray, active, travelled, depth = queue.pop()
-        pi = mi_scene.ray_intersect_preliminary(ray, coherent=depth == 0, active=active)
-        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-        active = active & si.is_valid()
-        travelled = travelled + dr.select(active, si.t, 0.0)
-        found.append(_read_hits(table, pi, si, active, travelled * pixel, ray))
-        if delta and depth < MAX_CHAIN:
-            queue += _next_rays(table, si, active, travelled, depth)
+    while waves:
+        ray, travelled, depth = waves.pop()
+        pi = mi_scene.ray_intersect_preliminary(ray, coherent=depth == 0)
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+        travelled = travelled + dr.select(si.is_valid(), si.t, 0.0)
+        hits = _hits(table, pi, si, travelled * pixel, ray)
+        following = _next_rays(table, si, depth) if follows and depth < MAX_CHAIN else []
+        # One launch a wave; what follows starts from memory instead of repeating the waves before it.
+        dr.eval(hits, following, travelled)
+        found.append(_read_hits(*hits))
+        for next_ray, valid in following:
+            lanes = dr.compress(valid)
+            if len(lanes):
+                next_ray = dr.gather(mi.Ray3f, next_ray, lanes)
+                waves.append((next_ray, dr.gather(mi.Float, travelled, lanes), depth + 1))
     return found
 
 
-def _read_hits(table, pi, si, active, footprint, ray) -> Hits:  # type: ignore[no-untyped-def]
-    shape = table.shape_index(si, active)
-    bits = dr.gather(mi.UInt32, table.lobe_bits_dr, shape, active)
-    cached = active & (has(bits, LobeClass.DIFFUSE) | has(bits, LobeClass.GLOSSY))
-    parametric = dr.gather(mi.Bool, mi.Bool(table.is_parametric), shape, active)
+def _hits(table, pi, si, footprint, ray):
+    """(whether the hit is on a cached surface, primitive, uv, side, footprint) of every lane."""
+    valid = si.is_valid()
+    shape = table.shape_index(si, valid)
+    bits = dr.gather(mi.UInt32, table.lobe_bits_dr, shape, valid)
+    cached = valid & (has(bits, LobeClass.DIFFUSE) | has(bits, LobeClass.GLOSSY))
+    parametric = dr.gather(mi.Bool, mi.Bool(table.is_parametric), shape, valid)
     uv = dr.select(parametric, si.uv, pi.prim_uv)
-    prim = dr.gather(mi.UInt32, table.prim_offset_dr, shape, active) + dr.select(parametric, 0, pi.prim_index)
+    prim = dr.gather(mi.UInt32, table.prim_offset_dr, shape, valid) + dr.select(parametric, 0, pi.prim_index)
     side = dr.select(dr.dot(si.n, ray.d) > 0, mi.UInt32(1), mi.UInt32(0))
-    dr.eval(cached, prim, uv, side, footprint)
+    return cached, prim, uv, side, footprint
+
+
+def _read_hits(cached, prim, uv, side, footprint) -> Hits:
     keep = cached.numpy().astype(bool)
     return Hits(
         prim.numpy()[keep].astype(np.int64),
@@ -106,20 +117,16 @@ def _read_hits(table, pi, si, active, footprint, ray) -> Hits:  # type: ignore[n
     )
 
 
-def _next_rays(table, si, active, travelled, depth):  # type: ignore[no-untyped-def]
-    shape = table.shape_index(si, active)
-    bits = dr.gather(mi.UInt32, table.lobe_bits_dr, shape, active)
-    active = active & has(bits, LobeClass.DELTA)
-    if not dr.any(active):
-        return []
-    a, b = delta_lobes(si.bsdf(), si, active)
+def _next_rays(table, si, depth):
+    """(ray, whether it is followed) behind delta surfaces: both lobes at the first hit, then the likelier."""
+    valid = si.is_valid()
+    bits = dr.gather(mi.UInt32, table.lobe_bits_dr, table.shape_index(si, valid), valid)
+    a, b = delta_lobes(si.bsdf(), si, valid & has(bits, LobeClass.DELTA))
     if depth == 0:
-        options = [(lobe.wo, lobe.valid & (lobe.pdf * dr.max(lobe.weight) > MIN_PROBABILITY)) for lobe in (a, b)]
+        options = [
+            (lobe.wo, lobe.valid & (lobe.pdf * dr.max(lobe.weight) > MIN_PROBABILITY)) for lobe in (a, b)
+        ]
     else:
         wo, _, valid = dominant_lobe(a, b)
         options = [(wo, valid)]
-    rays = []
-    for wo, valid in options:
-        if dr.any(valid):
-            rays.append((si.spawn_ray(si.to_world(wo)), valid, travelled, depth + 1))
-    return rays
+    return [(si.spawn_ray(si.to_world(wo)), valid) for wo, valid in options]

@@ -1,0 +1,103 @@
+"""The ablation as people read it: its rows as cells, for the terminal and for the benchmarks' page."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from rich.console import RenderableType
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
+
+from service.scores import REFUSED, human_bytes, human_seconds
+
+if TYPE_CHECKING:
+    from storage.store import Store
+    from workers.progress import Progress
+    from workers.scene import Scene
+    from workers.settings import Settings
+
+HEAD = ("variant", "IR PSNR dB", "final PSNR dB", "against ours dB", "SSIM", "FLIP", "bake paths", "bake",
+        "caches")  # fmt: skip
+LEGEND = (
+    "Every variant shares camera paths and references. A variant without a network is scored, and set "
+    "against ours, by its IR (marked *)."
+)
+OURS = "ours"
+
+Row = Mapping[str, Any]
+
+
+def measure_ablation(
+    scene: "Scene", store: "Store", settings: "Settings", progress: "Progress", command: str
+) -> dict[str, Any]:
+    """Runs every variant; what the store has of them is not computed again.
+
+    Args:
+        scene: the scene.
+        store: shared by all variants.
+        settings: ours; variants change parts of it.
+        progress: told about it.
+        command: the command line that asks for it.
+
+    Returns:
+        JSON: scene, width, height, preset, rows, command, commit, machine.
+    """
+    from workers.ablation import run_ablation
+    from workers.evaluate import commit, machine
+
+    if all(entry["digest"] != scene.digest for entry in store.scenes()):
+        store.register_scene(scene.digest, {"name": scene.name, "source": str(scene.source)})
+    rows = run_ablation(scene, store, settings, progress)
+    return {
+        "scene": scene.name, "width": settings.width, "height": settings.height, "preset": settings.preset,
+        "rows": rows, "command": command, "commit": commit(), "machine": machine(),
+    }  # fmt: skip
+
+
+def ablation_cells(rows: Sequence[Row]) -> list[list[str]]:
+    """A list of texts a row, in the order of `HEAD`."""
+    ours = next((row for row in rows if row["name"] == OURS), None)
+    return [_cells(row, ours) for row in rows]
+
+
+def _cells(row: Row, ours: Row | None) -> list[str]:
+    network = row["network"]
+    mark = "" if network else "*"
+    key = "psnr" if network else "ir_psnr"
+    against = None
+    if ours is not None and row[key] is not None and ours[key] is not None:
+        against = row[key] - ours[key]
+    return [
+        row["name"],
+        _number(row["ir_psnr"], "{:.2f}"),
+        _number(row["psnr"], "{:.2f}") if network else "-",
+        _number(against, "{:+.2f}", "-") + (mark if against is not None else ""),
+        _number(row["ssim"], "{:.4f}") + mark,
+        _number(row["flip"], "{:.4f}") + mark,
+        f"{row['bake_paths'] / 1e6:.3g} M",
+        human_seconds(row["bake_seconds"]),
+        human_bytes(row["cache_nbytes"]),
+    ]
+
+
+def _number(number: float | None, pattern: str, absent: str = REFUSED) -> str:
+    return absent if number is None else pattern.format(number)
+
+
+def ablation_table(ablation: Mapping[str, Any]) -> RenderableType:
+    """The rows as a terminal table, ours bold.
+
+    Args:
+        ablation: as `measure_ablation` returns it.
+    """
+    table = Table(
+        title=f"{escape(ablation['scene'])}, {ablation['width']}x{ablation['height']}, {ablation['preset']}",
+        title_style="bold",
+        caption=LEGEND,
+    )
+    for index, title in enumerate(HEAD):
+        table.add_column(title, justify="right" if index else "left", no_wrap=True)
+    for cells in ablation_cells(ablation["rows"]):
+        style = "bold cyan" if cells[0] == OURS else ""
+        table.add_row(*(Text(cell, style=style) for cell in cells))
+    return table

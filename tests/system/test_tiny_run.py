@@ -1,0 +1,159 @@
+"""The main job on `tiny`: every stage, resumed, damaged, and asked over HTTP for a frame."""
+
+import io
+import time
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+from PIL import Image
+
+from service.app import create_app
+from storage.caches import CacheSet
+from storage.frames import decode_frame
+from storage.store import Store
+from workers.bake import bake_refs, run_bake
+from workers.element_stage import run_elements
+from workers.pipeline import evaluate_scene, run_scene
+from workers.progress import Progress
+from workers.renderer import FrameRenderer, renderable_scenes
+from workers.run_state import RunState
+from workers.scene import load_scene
+from workers.settings import Settings
+from workers.train import Trainer, load_dataset, train_ref
+
+SIZE = 64
+CAMERA = {"look_at": {"origin": [0.0, 1.0, 2.4], "target": [0.0, 0.7, 0.0], "up": [0, 1, 0]}}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return load_scene("tiny", width=SIZE, height=SIZE)
+
+
+@pytest.fixture(scope="module")
+def settings():
+    return Settings.preset_named("tiny")
+
+
+@pytest.fixture(scope="module")
+def prepared(scene, settings, tmp_path_factory):
+    """(store, evaluation) after one whole run."""
+    store = Store.open(tmp_path_factory.mktemp("store"), create=True)
+    return store, run_scene(scene, store, settings, Progress())
+
+
+def test_run_result_has_every_method_and_finite_scores(prepared):
+    _, evaluation = prepared
+    rows = {row["name"]: row for row in evaluation.result["rows"]}
+    assert {"ours", "ir", "ir+oidn", "pt-1", "pt-1+oidn-fast", "pt-1+oidn-high"} <= set(rows)
+    for row in rows.values():
+        assert row["non_finite"] == 0
+        assert row["ms"] > 0
+        assert np.isfinite([row[key] for key in ("psnr", "ssim", "flip", "relmse", "temporal")]).all()
+    assert {stage["name"] for stage in evaluation.result["stages"]} >= {"elements", "bake", "train", "evaluate"}
+    assert evaluation.result["cache_nbytes"] > 0
+    assert evaluation.result["network_nbytes"] > 0
+
+
+def test_run_ir_is_closer_to_the_reference_than_one_path(prepared):
+    rows = {row["name"]: row for row in prepared[1].result["rows"]}
+    assert rows["ir"]["psnr"] > rows["pt-1"]["psnr"] + 5.0
+    assert rows["ours"]["psnr"] > rows["pt-1"]["psnr"] + 5.0
+
+
+def test_run_again_computes_nothing(prepared, scene, settings):
+    store, _ = prepared
+    before = {ref: store.committed(ref)["created_unix_s"] for stage in ("elements", "render", "inputs", "train")
+              for ref in store.units(scene.digest, stage)}  # fmt: skip
+    start = time.perf_counter()
+    run = RunState(scene, store, settings)
+    elements = run_elements(run)
+    run_bake(run, elements)
+    assert "bake" not in run.seconds
+    evaluate_scene(scene, store, settings, Progress())
+    assert time.perf_counter() - start < 60
+    after = {ref: store.committed(ref)["created_unix_s"] for ref in before}
+    assert after == before
+
+
+def test_bake_of_a_lost_unit_is_bit_identical(prepared, scene, settings):
+    store, _ = prepared
+    run = RunState(scene, store, settings)
+    elements = run_elements(run)
+    for ref in bake_refs(run, elements).values():
+        caches = CacheSet.open(store, ref)
+        before = caches.load()
+        store_files = caches.unit_record(0)
+        caches.discard_unit(0)
+        _rebake(run, elements, ref)
+        after = CacheSet.open(store, ref).load()
+        for name in before:
+            np.testing.assert_array_equal(after[name], before[name])
+        assert CacheSet.open(store, ref).unit_record(0)["rows_sha256"] == store_files["rows_sha256"]
+
+
+def _rebake(run, elements, ref):
+    from workers.bake import _bake_lobe, _lobes
+
+    lobe = next(lobe for lobe in _lobes(run, elements) if run.ref("bake", lobe.params) == ref)
+    _bake_lobe(run, lobe, ref)
+
+
+def test_trainer_resumes_with_the_identical_next_loss(prepared, scene, settings, tmp_path):
+    from workers.inputs import inputs_ref
+    from workers.render import render_ref
+
+    store, _ = prepared
+    run = RunState(scene, store, settings.override({"train.seconds": 0.0, "train.epochs": 2}))
+    elements = run_elements(run)
+    inputs = [inputs_ref(run, elements, camera) for camera in run.paths.train]
+    renders = [render_ref(run, camera, run.settings.frames.train_spp) for camera in run.paths.train]
+    dataset = load_dataset(run, inputs, renders)
+    ref = train_ref(run, inputs, renders)
+    first = Trainer(run, ref, dataset, None)
+    first.num_steps = 10
+    for _ in range(3):
+        first.train_step()
+    first.save_checkpoint()
+    expected = [first.train_step()["total"] for _ in range(2)]
+    resumed = Trainer(run, ref, dataset, None)
+    assert resumed.step == 3
+    assert [resumed.train_step()["total"] for _ in range(2)] == expected
+
+
+def test_renderer_answers_a_pose_far_outside_the_domain(prepared, scene):
+    from workers.camera import Camera
+
+    renderer = FrameRenderer.open(prepared[0], scene.digest)
+    bounds = scene.bounds_centre
+    camera = Camera.look_at(bounds + [0.05, 0.3, -0.1], bounds, [1, 0, 0], 100.0, 48, 40)
+    frame = renderer.render(camera)
+    assert frame.radiance.shape == (40, 48, 3)
+    assert frame.non_finite == 0
+    assert 0.0 <= frame.coverage <= 1.0
+    assert frame.radiance.max() > 0
+
+
+def test_service_answers_a_frame_in_every_format(prepared, scene):
+    store, _ = prepared
+    assert [entry["name"] for entry in renderable_scenes(store)] == ["tiny"]
+    direct = FrameRenderer.open(store, "tiny").render(_camera(scene))
+    body = {"camera": {"to_world": scene.camera.to_world.tolist()}, "fov_deg": scene.camera.fov_deg,
+            "width": SIZE, "height": SIZE}  # fmt: skip
+    with TestClient(create_app(store.url)) as client:
+        listed = client.get("/v1/scenes")
+        assert listed.status_code == 200
+        png = client.post("/v1/scenes/tiny/frame", json=body, headers={"Accept": "image/png"})
+        exr = client.post("/v1/scenes/tiny/frame", json=body, headers={"Accept": "image/x-exr"})
+    assert png.status_code == 200, png.text
+    assert all(name in png.headers["Server-Timing"] for name in ("query;dur=", "network;dur=", "encode;dur="))
+    assert Image.open(io.BytesIO(png.content)).size == (SIZE, SIZE)
+    assert exr.status_code == 200
+    radiance = decode_frame(exr.content)["radiance"]
+    # fp32 or bf16 is chosen by measured time, anew in each process' renderer.
+    np.testing.assert_allclose(radiance, direct.radiance, rtol=0.05, atol=0.02 * float(direct.radiance.max()))
+
+
+def _camera(scene):
+    return scene.camera.resized(SIZE, SIZE)

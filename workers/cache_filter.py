@@ -1,0 +1,69 @@
+"""Denoising of caches: neighbouring elements share light, so they share samples.
+
+A joint-bilateral average over the nearest elements of the same shape. Place and normal decide for both lobes; the
+diffuse lobe is also guarded by its own measured variance, so that a shadow's edge is kept where it stands out of
+the noise (the range weight of non-local means with known variance, Rousselle et al. 2012, with one value for a
+patch).
+"""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from workers.elements import ElementSet
+
+NUM_NEIGHBOURS = 12
+NORMAL_POWER = 16
+RANGE_STRENGTH = 1.0
+# A neighbour further than this many median spacings is no neighbour.
+MAX_SPACINGS = 3.0
+
+
+def filter_diffuse(elements: ElementSet, mean: np.ndarray, standard_error: np.ndarray) -> np.ndarray:
+    """Denoised diffuse lobe.
+
+    Args:
+        elements: where the values sit.
+        mean: float32 [n, 3], linear radiance.
+        standard_error: of `mean`, float32 [n, 3].
+
+    Returns:
+        float32 [n, 3].
+    """
+    index, weight = _neighbours(elements, np.arange(elements.num_elements))
+    variance = np.mean(standard_error.astype(np.float64) ** 2, axis=1)
+    # An element's own estimate of variance is noisy (a firefly raises both): pool it over the neighbourhood.
+    pooled = np.sum(weight * variance[index], axis=1) / np.sum(weight, axis=1)
+    difference = np.mean((mean[index].astype(np.float64) - mean[:, None]) ** 2, axis=2)
+    noise = pooled[index] + pooled[:, None]
+    range_weight = np.exp(-np.maximum(difference - noise, 0.0) / (RANGE_STRENGTH * noise + 1e-12))
+    total = weight * range_weight
+    result = np.einsum("nk,nkc->nc", total, mean[index].astype(np.float64)) / total.sum(axis=1, keepdims=True)
+    return result.astype(np.float32)
+
+
+def filter_directional(elements: ElementSet, values: np.ndarray) -> np.ndarray:
+    """Denoised directional lobe: place and normal alone; float32 [g, polar, azimuth, 3], as given."""
+    if len(values) == 0:
+        return values
+    index, weight = _neighbours(elements, elements.glossy)
+    weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+    result = np.zeros_like(values)
+    for k in range(index.shape[1]):
+        result += values[index[:, k]] * weight[:, k, None, None, None]
+    return result
+
+
+def _neighbours(elements: ElementSet, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Nearest members of each member (itself first) and their weights; int64, float64 [n, k]."""
+    position, normal = elements.position[members].astype(np.float64), elements.normal[members].astype(np.float64)
+    shape, side = elements.shape[members], elements.side[members]
+    k = min(NUM_NEIGHBOURS, len(members))
+    distance, index = cKDTree(position).query(position, k=k, workers=2)
+    distance, index = distance.reshape(len(members), k), index.reshape(len(members), k)
+    spacing = np.maximum(np.median(distance[:, 1:5], axis=1) if k > 4 else distance[:, -1], 1e-30)
+    weight = np.exp(-0.5 * (distance / spacing[:, None]) ** 2)
+    weight *= np.maximum(np.einsum("nkc,nc->nk", normal[index], normal), 0.0) ** NORMAL_POWER
+    weight *= (shape[index] == shape[:, None]) & (side[index] == side[:, None])
+    weight *= distance <= MAX_SPACINGS * spacing[:, None]
+    weight[:, 0] = np.maximum(weight[:, 0], 1e-6)
+    return index, weight

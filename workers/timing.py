@@ -1,0 +1,77 @@
+"""Wall times that may be compared, and what the machine can compute at most.
+
+Methods that are compared are timed interleaved: each round runs every one once, so that a slow phase of the
+machine hits all alike, and medians count. A first round, not counted, compiles and warms up.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import psutil
+import torch
+
+from workers.progress import Progress
+
+MATMUL_EDGE = 2048
+MATMUL_REPEATS = 4
+
+
+def interleaved_medians(
+    methods: dict[str, Callable[[int], object]], repeats: int, progress: Progress, description: str
+) -> dict[str, float]:
+    """Median wall seconds of each method.
+
+    Args:
+        methods: name to function of the round's index (0 is the round that is not counted); each must return
+            only when its work is done.
+        repeats: counted rounds, at least 1.
+        progress: told round by round.
+        description: for the progress.
+    """
+    times: dict[str, list[float]] = {name: [] for name in methods}
+    with progress.track(description, repeats + 1) as advance:
+        for index in range(repeats + 1):
+            for name, method in methods.items():
+                start = time.perf_counter()
+                method(index)
+                seconds = time.perf_counter() - start
+                if index:
+                    times[name].append(seconds)
+            advance()
+    return {name: float(np.median(values)) for name, values in times.items()}
+
+
+@contextmanager
+def other_load() -> Iterator[dict[str, float]]:
+    """Measures what else ran meanwhile: times taken on a busy machine are too long.
+
+    Yields:
+        A dict that holds "other_cpus" (mean number of CPU threads that other processes kept busy) and "cpus"
+        once the block has ended.
+    """
+    load: dict[str, float] = {}
+    own = psutil.Process()
+    busy, mine, wall = _busy_seconds(psutil.cpu_times()), sum(own.cpu_times()[:2]), time.perf_counter()
+    yield load
+    elapsed = max(time.perf_counter() - wall, 1e-9)
+    others = _busy_seconds(psutil.cpu_times()) - busy - (sum(own.cpu_times()[:2]) - mine)
+    load |= {"other_cpus": max(others, 0.0) / elapsed, "cpus": float(psutil.cpu_count() or 1)}
+
+
+def _busy_seconds(times: object) -> float:
+    return sum(getattr(times, name, 0.0) for name in ("user", "nice", "system", "irq", "softirq", "steal"))
+
+
+def matmul_gflop_per_s(dtype: torch.dtype, device: torch.device, edge: int = MATMUL_EDGE) -> float:
+    """Best rate of a few products of two edge x edge matrices, GFLOP/s (a multiply-add is 2)."""
+    a, b = (torch.rand(edge, edge, device=device).to(dtype) for _ in range(2))
+    times = []
+    for _ in range(MATMUL_REPEATS + 1):
+        start = time.perf_counter()
+        product = a @ b
+        if product.is_cuda:
+            torch.cuda.synchronize()
+        times.append(time.perf_counter() - start)
+    return 2.0 * edge**3 / min(times[1:]) / 1e9
