@@ -3,17 +3,23 @@
 #   make test     the whole gate: make check, then the tests
 #   make check    lint, format, types, layering
 #   make format   put the code into the house format
+#   make benchmarks SCENES="a.xml tabletop"   measure scenes and write docs/benchmarks.md of all measured so far
 #   make clean    remove the environment and what the tools left
 
 # The CPU build of torch is the default. For the build of your package index (CUDA on Linux): make TORCH=any ...
 TORCH ?= cpu
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 
+# What `make benchmarks` measures, where it keeps the results, and further options (--size 1280x720, --ablate).
+SCENES ?= tabletop
+STORE ?= ./store
+BENCHMARK_OPTIONS ?= --preset draft --resolution 256x256
+
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 CONSTRAINTS := -c constraints.txt $(if $(filter cpu,$(TORCH)),-c constraints-cpu.txt)
 
-.PHONY: demo test check format clean venv
+.PHONY: demo test check format benchmarks clean venv
 .DELETE_ON_ERROR:
 
 demo: .venv/.ready
@@ -31,6 +37,10 @@ check: .venv/.ready
 format: .venv/.ready
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+benchmarks: .venv/.ready
+	$(BIN)/lightwell benchmark --store $(STORE) --output docs/benchmarks.md \
+	  $(foreach scene,$(SCENES),--scene $(scene)) $(BENCHMARK_OPTIONS)
 
 venv: .venv/.ready
 

@@ -275,6 +275,8 @@ def serve(
 def main() -> None:
     """Entry point of the `lightwell` script."""
     os.environ.setdefault("MPLBACKEND", "Agg")
+    import workers  # noqa: F401  # sets the thread policy before anything imports torch
+
     app()
 
 

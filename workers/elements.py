@@ -20,6 +20,7 @@ from workers.lattice import (
     patch_levels,
     patches_per_prim,
     point_parameters,
+    tessellation_counts,
 )
 from workers.lobes import LobeClass
 from workers.settings import CacheSettings
@@ -74,10 +75,12 @@ class ElementSet:
 
 @dataclass(frozen=True)
 class _Lattice:
-    """Patches and the lattice points that hits touch (point * 2 + side, sorted unique)."""
+    """Patches, the lattice points that hits touch (point * 2 + side, sorted unique), and the spacing that was asked
+    for in each patch, scene units: triangles may be smaller than that."""
 
     patches: PatchTable
     touched: np.ndarray
+    asked_spacing: np.ndarray
 
 
 def build_elements(table: SurfaceTable, hits: Hits, settings: CacheSettings) -> ElementSet:
@@ -90,7 +93,8 @@ def build_elements(table: SurfaceTable, hits: Hits, settings: CacheSettings) -> 
 def _solve_spacing(table: SurfaceTable, hits: Hits, settings: CacheSettings) -> tuple[_Lattice, float]:
     """Smallest spacing of the lattice whose seen elements fit the budget, by bisection on a log scale."""
     if settings.elements != "lattice":
-        return _plain_lattice(table, hits, 1 if settings.elements == "vertex" else 0), 0.0
+        level = 1 if settings.elements == "vertex" else 0
+        return _plain_lattice(table, hits, level, settings.max_edge_fraction), 0.0
     prim_footprint = np.full(table.num_prims, np.inf, np.float32)
     np.minimum.at(prim_footprint, hits.prim, hits.footprint)
     located = _LocatedHits.of(table, hits, patch_counts(table.prim_edge, prim_footprint))
@@ -160,17 +164,20 @@ class _LocatedHits:
 
     def lattice(self, spacing_px: float) -> _Lattice:
         """The lattice with points `spacing_px` apart where patches are seen."""
-        return self.with_levels(patch_levels(self.patch_edge, self.patch_footprint, spacing_px))
+        asked = np.where(np.isfinite(self.patch_footprint), spacing_px * self.patch_footprint, 0.0)
+        return self.with_levels(patch_levels(self.patch_edge, self.patch_footprint, spacing_px), asked)
 
-    def with_levels(self, level: np.ndarray) -> _Lattice:
+    def with_levels(self, level: np.ndarray, asked_spacing: np.ndarray) -> _Lattice:
         """The lattice with given levels of all patches."""
         patches = build_patch_table(self.m, level, self.square)
-        return _Lattice(patches, _touched(patches, self.patch, self.b1, self.b2, self.side))
+        return _Lattice(patches, _touched(patches, self.patch, self.b1, self.b2, self.side), asked_spacing)
 
 
-def _plain_lattice(table: SurfaceTable, hits: Hits, level: int) -> _Lattice:
-    located = _LocatedHits.of(table, hits, np.ones(table.num_prims, np.uint32))
-    return located.with_levels(np.full(len(located.patch_edge), level, np.uint32))
+def _plain_lattice(table: SurfaceTable, hits: Hits, level: int, max_edge_fraction: float) -> _Lattice:
+    """Paper's caches: one element a (tessellated) triangle or vertex."""
+    located = _LocatedHits.of(table, hits, tessellation_counts(table.prim_edge, table.diagonal, max_edge_fraction))
+    num_patches = len(located.patch_edge)
+    return located.with_levels(np.full(num_patches, level, np.uint32), np.zeros(num_patches))
 
 
 def _touched(
@@ -231,7 +238,8 @@ def surface_frame(
 def _point_spacing(table: SurfaceTable, lattice: _Lattice, point: np.ndarray, prim: np.ndarray) -> np.ndarray:
     patch = np.searchsorted(lattice.patches.patch_base, point, side="right") - 1
     level = np.maximum(lattice.patches.patch_level[patch], 1)
-    return table.prim_edge[prim] / lattice.patches.prim_patches[prim] / level
+    laid = table.prim_edge[prim] / lattice.patches.prim_patches[prim] / level
+    return np.maximum(laid, lattice.asked_spacing[patch])
 
 
 def _merge_key(

@@ -53,6 +53,23 @@ def patch_counts(prim_edge: np.ndarray, prim_footprint: np.ndarray) -> np.ndarra
     return np.clip(np.nan_to_num(wanted, nan=1.0), 1, MAX_PATCHES).astype(np.uint32)
 
 
+def tessellation_counts(prim_edge: np.ndarray, diagonal: float, max_edge_fraction: float) -> np.ndarray:
+    """m of each primitive for the paper's caches: sub-triangles with edges of at most a share of the scene.
+
+    The paper tessellates large triangles before it bakes. Splitting a flat triangle into m x m similar ones changes
+    neither its geometry nor its interpolated attributes, so the patches are the tessellated triangles and mesh, BVH
+    and ground truth stay as they are (and watertight where they were).
+
+    Args:
+        prim_edge: longest edge of each primitive, scene units.
+        diagonal: of the scene's bounding box, scene units.
+        max_edge_fraction: longest edge allowed as a share of `diagonal`; 0 keeps every triangle whole.
+    """
+    if max_edge_fraction <= 0:
+        return np.ones(len(prim_edge), np.uint32)
+    return np.clip(np.ceil(prim_edge / (max_edge_fraction * diagonal)), 1, MAX_PATCHES).astype(np.uint32)
+
+
 def patch_levels(edge: np.ndarray, footprint: np.ndarray, spacing_px: float) -> np.ndarray:
     """n of each patch: points `spacing_px` footprints apart, at least the corners; 0 where it is never seen."""
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -72,7 +72,10 @@ def delta_lobes(
     ctx = context(int(mi.BSDFFlags.Delta))
     last, last_weight = bsdf.sample(ctx, si, mi.Float(LAST_LOBE), mi.Point2f(0.5), active)
     first, first_weight = bsdf.sample(ctx, si, mi.Float(FIRST_LOBE), mi.Point2f(0.5), active)
-    last_valid, first_valid = active & (last.pdf > 0), active & (first.pdf > 0)
+    # A nested material may ignore the context (principled does) and answer with a rough sample.
+    last_valid, first_valid = (
+        active & (sample.pdf > 0) & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta) for sample in (last, first)
+    )
     distinct = first_valid & (~last_valid | (first.sampled_type != last.sampled_type))
     return (
         DeltaLobe(last.wo, last_weight, last.pdf, last_valid),

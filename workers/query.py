@@ -63,6 +63,7 @@ class QueryProgram:
         self._places = mi.Float(np.array(_GRIDS[settings.samples], np.float32).reshape(-1))
         self._state = (self._places, *self.shading.state())
         program = self._program if settings.weights == "barycentric" else self._paper_program
+        self._program_unfrozen = program
         self._replay = dr.freeze(
             program, state_fn=lambda *_: self._state, limit=MAX_RECORDINGS, warn_after=1000
         )
@@ -80,8 +81,14 @@ class QueryProgram:
             sample's hit in world space (NaN on a miss).
         """
         width, height = camera.width, camera.height
+        device = DeviceCamera.upload(camera)
         with _no_collection():
-            outputs = self._replay(DeviceCamera.upload(camera), width, height)
+            try:
+                outputs = self._replay(device, width, height)
+            except RuntimeError:
+                # Dr.Jit 1.5 cannot record while a material outside any scene is alive in this process.
+                self._replay = self._program_unfrozen
+                outputs = self._replay(device, width, height)
         if self.settings.weights == "barycentric":
             return outputs.numpy().reshape(height, width, NUM_CHANNELS)
         image, weighted = outputs

@@ -49,7 +49,7 @@ class CacheSettings:
     directional_spp: int = 8
     passes: int = 1
     elements_per_unit: int = 256
-    max_edge_fraction: float = 0.02
+    max_edge_fraction: float = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,12 +104,13 @@ class TrainSettings:
         residual: the network corrects the imperfect radiance instead of replacing it.
         transfer: "mu_law" or "log1p" (the paper).
         l1_weight, perceptual_weight, gradient_weight: terms of the loss.
+        perceptual_every: steps between two uses of the perceptual term (its weight grows alike).
         epochs: passes over the training frames; `seconds` ends training earlier when above 0.
         batch: crops per step.
         crop: crop edge in pixels.
         schedule: "paper" (x 0.95 per epoch) or "cosine" (one cycle with warm-up).
         learning_rate: Adam's.
-        precision: "fp32", "bf16" or "auto" (measured).
+        precision: of training and inference: "fp32", "bf16" or "auto" (measured).
     """
 
     widths: tuple[int, ...] = (32, 48, 64)
@@ -120,8 +121,9 @@ class TrainSettings:
     l1_weight: float = 1.0
     perceptual_weight: float = 0.03
     gradient_weight: float = 0.0
+    perceptual_every: int = 4
     epochs: int = 400
-    seconds: float = 600.0
+    seconds: float = 480.0
     batch: int = 4
     crop: int = 128
     schedule: Literal["paper", "cosine"] = "cosine"
@@ -281,7 +283,7 @@ _POSITIVE = (
     "width", "height", "cache.max_elements", "cache.min_spacing_px", "cache.domain_poses", "cache.diffuse_spp",
     "cache.azimuth", "cache.polar", "cache.directional_spp", "cache.passes", "cache.elements_per_unit",
     "frames.num_train", "frames.num_validation", "frames.num_test", "frames.train_spp", "frames.test_spp",
-    "frames.passes", "train.batch", "train.crop", "train.epochs", "train.learning_rate",
+    "frames.passes", "train.batch", "train.crop", "train.perceptual_every", "train.epochs", "train.learning_rate",
     "evaluation.timing_repeats",
 )  # fmt: skip
 
@@ -293,6 +295,10 @@ def _check(settings: Settings) -> None:
             value = getattr(value, name)
         if not value > 0:
             raise SettingsError(f"setting {key!r} must be above 0, got {value}")
+    if settings.query.weights != "barycentric" and settings.cache.lobes != "exitant":
+        raise SettingsError(
+            f"setting 'query.weights' must be barycentric unless cache.lobes is exitant, got {settings.query.weights}"
+        )
     if settings.query.samples not in (1, 2, 3, 4):
         raise SettingsError(f"setting 'query.samples' must be 1 to 4, got {settings.query.samples}")
     if settings.train.unshuffle not in (1, 2, 4):

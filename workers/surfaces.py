@@ -32,6 +32,7 @@ class SurfaceTable:
         index_of_registry: stable shape index by registry id; mi.UInt32.
         prim_offset_dr: `prim_offset` on the device; mi.UInt32.
         lobe_bits_dr: `LobeClass` bits by stable shape index; mi.UInt32.
+        diagonal: of the scene's bounding box, scene units.
     """
 
     shapes: list
@@ -43,6 +44,7 @@ class SurfaceTable:
     index_of_registry: "mi.UInt32"
     prim_offset_dr: "mi.UInt32"
     lobe_bits_dr: "mi.UInt32"
+    diagonal: float
 
     @property
     def num_prims(self) -> int:
@@ -156,6 +158,7 @@ def build_surface_table(mi_scene: "mi.Scene") -> SurfaceTable:
         index_of_registry=mi.UInt32(lookup),
         prim_offset_dr=mi.UInt32(offset.astype(np.uint32)),
         lobe_bits_dr=mi.UInt32(np.array([int(lobe) for lobe in lobes], np.uint32)),
+        diagonal=float(dr.norm(mi_scene.bbox().extents())),
     )
 
 

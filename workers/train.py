@@ -30,7 +30,7 @@ CHECKPOINT_STAGE = "checkpoint"
 WEIGHTS_FILE, CONFIG_FILE, CHECKPOINT_FILE = "network.safetensors", "network.json", "checkpoint.pt"
 CHECKPOINT_SECONDS = 60.0
 VALIDATIONS = 20
-PROBE_STEPS = 6
+PROBE_STEPS = 8
 
 
 @dataclass
@@ -114,12 +114,11 @@ class Trainer:
             fusion=self.settings.fusion, unshuffle=self.settings.unshuffle, residual=self.settings.residual,
         )  # fmt: skip
         self.network = FusionNet(self.config).to(self.device, memory_format=torch.channels_last)
-        self.optimizer = torch.optim.Adam(
-            self.network.parameters(), lr=self.settings.learning_rate, betas=(0.9, 0.999)
-        )
-        self.loss = self._loss()
+        self.optimizer = self._optimizer()
+        self.loss, self.plain_loss = self._losses()
         self.rng = np.random.default_rng(seed)
         self.step, self.num_steps, self.skipped = 0, 0, 0
+        self.autocast = False
         self.curve: list[dict[str, float]] = []
         self._best: dict[str, Tensor] | None = None
         self._encode_sets()
@@ -127,7 +126,8 @@ class Trainer:
 
     # ------------------------------------------------ set-up ------------------------------------------------
 
-    def _loss(self) -> ReconstructionLoss:
+    def _losses(self) -> tuple[ReconstructionLoss, ReconstructionLoss]:
+        """The loss with its perceptual term and the one of the steps between."""
         settings = self.settings
         perceptual = None
         if settings.perceptual_weight > 0:
@@ -140,8 +140,16 @@ class Trainer:
             else:
                 perceptual = StLpips(weights["alex"] if "alex" in weights else weights["vgg"]).to(self.device)
         gradient = settings.gradient_weight if settings.gradient_weight > 0 else None
-        config = LossConfig(l1=settings.l1_weight, perceptual=settings.perceptual_weight, gradient=gradient)
-        return ReconstructionLoss(config, transfer=self.encoding.transfer, perceptual=perceptual)
+        every = settings.perceptual_every if settings.l1_weight > 0 else 1
+        transfer = self.encoding.transfer
+        config = LossConfig(
+            l1=settings.l1_weight, perceptual=settings.perceptual_weight * every, gradient=gradient
+        )
+        full = ReconstructionLoss(config, transfer=transfer, perceptual=perceptual)
+        if perceptual is None or settings.l1_weight == 0:
+            return full, full
+        plain = LossConfig(l1=settings.l1_weight, perceptual=0.0, gradient=gradient)
+        return full, ReconstructionLoss(plain, transfer=transfer)
 
     def _encode_sets(self) -> None:
         """Frames in network space, kept channels-last."""
@@ -159,6 +167,7 @@ class Trainer:
         self.rng.bit_generator.state = state["rng"]
         torch.set_rng_state(state["torch_rng"])
         self.step, self.num_steps, self.skipped = state["step"], state["num_steps"], state["skipped"]
+        self.autocast = state["autocast"]
         self.curve, self._best = state["curve"], state["best"]
 
     # ----------------------------------------------- training ----------------------------------------------
@@ -183,24 +192,40 @@ class Trainer:
                     saved = time.perf_counter()
 
     def _planned_steps(self) -> int:
-        """Steps of all epochs, fewer where the time budget ends first (measured over a few steps, then fixed)."""
+        """Chooses the precision and the number of steps: all epochs, fewer where the time budget ends first.
+
+        Both are measured over a few steps, then undone and fixed, so that a resumed run keeps them.
+        """
         settings = self.settings
-        full = max(1, settings.epochs * max(1, -(-self._crops_per_epoch() // settings.batch)))
+        full = max(1, settings.epochs * self._steps_per_epoch())
+        if settings.seconds <= 0 and settings.precision == "fp32":
+            return full
+        seconds = {False: self._probe(full, False)}
+        if settings.precision != "fp32":
+            seconds[True] = self._probe(full, True)
+        self.autocast = settings.precision == "bf16" or min(seconds, key=lambda key: seconds[key])
         if settings.seconds <= 0:
             return full
-        state = {k: v.clone() for k, v in self.network.state_dict().items()}
-        rng, optimizer = self.rng.bit_generator.state, self.optimizer.state_dict()
-        self.num_steps = full
-        times = []
-        for _ in range(min(PROBE_STEPS, full)):
-            start = time.perf_counter()
+        return int(np.clip(settings.seconds / seconds[self.autocast], 1, full))
+
+    def _probe(self, num_steps: int, autocast: bool) -> float:
+        """Mean seconds of a step; leaves weights, optimizer, random state and cursor as they were."""
+        state = {name: value.clone() for name, value in self.network.state_dict().items()}
+        rng, torch_rng, skipped = self.rng.bit_generator.state, torch.get_rng_state(), self.skipped
+        self.num_steps, self.autocast = num_steps, autocast
+        self.train_step()
+        start = time.perf_counter()
+        for _ in range(PROBE_STEPS):
             self.train_step()
-            times.append(time.perf_counter() - start)
+        seconds = (time.perf_counter() - start) / PROBE_STEPS
         self.network.load_state_dict(state)
-        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=settings.learning_rate, betas=(0.9, 0.999))
-        del optimizer
-        self.rng.bit_generator.state, self.step = rng, 0
-        return int(np.clip(settings.seconds / float(np.median(times)), 1, full))
+        self.optimizer = self._optimizer()
+        self.rng.bit_generator.state, self.step, self.num_steps, self.skipped = rng, 0, 0, skipped
+        torch.set_rng_state(torch_rng)
+        return seconds
+
+    def _optimizer(self) -> torch.optim.Optimizer:
+        return torch.optim.Adam(self.network.parameters(), lr=self.settings.learning_rate, betas=(0.9, 0.999))
 
     def _crops_per_epoch(self) -> int:
         """Crops that cover every training pixel once."""
@@ -219,8 +244,9 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = lr
         self.optimizer.zero_grad(set_to_none=True)
-        output = self.network(ir, gbuffer)
-        terms = self.loss(output.float(), target)
+        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.autocast):
+            output = self.network(ir, gbuffer)
+        terms = self._loss_terms(output.float(), target)
         terms["total"].backward()
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.settings.clip_norm)
         if torch.isfinite(norm):
@@ -234,6 +260,14 @@ class Trainer:
                 )
         self.step += 1
         return {name: float(value.detach()) for name, value in terms.items()}
+
+    def _loss_terms(self, output: Tensor, target: Tensor) -> dict[str, Tensor]:
+        """The loss; its perceptual term costs several network passes, so it is taken on every
+        `perceptual_every`-th step with that much more weight."""
+        every = self.settings.perceptual_every
+        takes_perceptual = self.step % every == 0 or self.settings.l1_weight == 0
+        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.autocast):
+            return (self.loss if takes_perceptual else self.plain_loss)(output, target)
 
     def _steps_per_epoch(self) -> int:
         return max(1, -(-self._crops_per_epoch() // self.settings.batch))
@@ -293,7 +327,7 @@ class Trainer:
         ref = self.run.ref(CHECKPOINT_STAGE, params)
         state = {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict(),
                  "rng": self.rng.bit_generator.state, "torch_rng": torch.get_rng_state(), "step": self.step,
-                 "num_steps": self.num_steps, "skipped": self.skipped, "curve": self.curve,
+                 "num_steps": self.num_steps, "skipped": self.skipped, "autocast": self.autocast, "curve": self.curve,
                  "best": self._best}  # fmt: skip
         older = checkpoints(self.run, self.ref)
         self.run.store.commit(ref, {CHECKPOINT_FILE: encode_checkpoint(state)}, params)

@@ -71,7 +71,8 @@ def make_record(scene: str = "hall", **more: Any) -> dict[str, Any]:
     result = make_result(scene=scene)
     return {
         "schema": 1, "scene": scene, "source": f"scenes/{scene}/scene.xml", "digest": "d1",
-        "command": "lightwell a", "commit": "0123abc", "machine": "2 CPU threads", "result": result, **MEASURED, **more,
+        "command": "lightwell a", "commit": "0123abc", "machine": "2 CPU threads", "result": result,
+        **MEASURED, **more,
     }  # fmt: skip
 
 
@@ -98,7 +99,8 @@ def store(tmp_path: Path) -> Store:
 def test_sentences_tell_wins_and_losses_in_numbers() -> None:
     assert trade.sentences(make_result()) == [
         "At equal time: no denoised path-traced row is as fast as our frame (20.0 ms); the fastest, "
-        "pt-1+oidn-fast, takes 6.25 times as long, and ours is 4.00 dB better in PSNR and 0.0400 better in FLIP.",
+        "pt-1+oidn-fast, takes 6.25 times as long, and ours is 4.00 dB better in PSNR and 0.0400 better in "
+        "FLIP.",
         "The fastest denoised row with a higher PSNR than ours is pt-16+oidn-high: 0.50 dB more, in 100.00 "
         "times our time.",
         "Against pt-1+oidn-high: ours is 3.00 dB better in PSNR and 0.0100 worse in FLIP, in 0.08 times its "

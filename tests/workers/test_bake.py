@@ -59,7 +59,6 @@ MATERIALS: dict[str, dict[str, Any]] = {
     "principledthin": {"type": "principledthin", "base_color": COLOUR, "roughness": 0.4, "diff_trans": 0.6},
 }
 NAMES = list(MATERIALS)
-BROKEN = {"mask_principled": "delta_lobes takes the rough sample of a nested principled for a delta one"}
 GRID = (2, 3)  # azimuth, polar
 BINS = GRID[0] * GRID[1]
 MAX_Z = 4.9  # two-sided 1e-6 per number, at fixed seeds
@@ -199,10 +198,7 @@ def radiance_along(scene: "mi.Scene", rays: list[Any], count: int) -> np.ndarray
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.xfail(strict=True, reason=BROKEN[name]))
-        if name in BROKEN
-        else name
-        for name in NAMES
+        name for name in NAMES
     ],
 )
 def test_lobes_sum_to_what_mitsuba_renders(split: Split, name: str) -> None:

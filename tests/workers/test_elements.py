@@ -142,8 +142,8 @@ def test_lobe_that_does_not_occur_has_no_slots() -> None:
 
 def test_vertex_and_triangle_modes_count_as_the_mesh_does() -> None:
     table, hits = seen_from_above(*quad_grid(6), fov_deg=40.0)
-    vertices = build_elements(table, hits, CacheSettings(elements="vertex"))
-    triangles = build_elements(table, hits, CacheSettings(elements="triangle"))
+    vertices = build_elements(table, hits, CacheSettings(elements="vertex", max_edge_fraction=0.0))
+    triangles = build_elements(table, hits, CacheSettings(elements="triangle", max_edge_fraction=0.0))
     assert vertices.num_elements == 7 * 7, "one per mesh vertex"
     assert triangles.num_elements == 2 * 6 * 6, "one per triangle"
     positions, faces = quad_grid(6)
@@ -154,7 +154,16 @@ def test_vertex_and_triangle_modes_count_as_the_mesh_does() -> None:
     )
 
 
-@pytest.mark.xfail(strict=True, reason="the merge voxel is the triangle's edge, not the spacing on screen")
+def test_long_edges_are_cut_for_the_papers_caches() -> None:
+    table, hits = seen_from_above(*quad_grid(2), fov_deg=40.0)
+    settings = CacheSettings(elements="triangle", max_edge_fraction=0.1)
+    elements = build_elements(table, hits, settings)
+    cuts = elements.patches.prim_patches
+    # Edges of sqrt 2 against a tenth of the mesh's diagonal, 2 sqrt 2: five patches along each.
+    np.testing.assert_array_equal(cuts, 5)
+    assert elements.num_elements == 8 * 5 * 5
+
+
 def test_fine_meshes_share_elements() -> None:
     ball = icosphere(0.5, 4)
     table, hits = seen_from_above(ball.positions, ball.faces, fov_deg=60.0, rays=20000)

@@ -155,7 +155,6 @@ def test_program_is_bit_identical_twice(tiny: Seen) -> None:
     np.testing.assert_array_equal(images[0], images[1])
 
 
-@pytest.mark.xfail(strict=True, reason="a frozen program cannot call materials that belong to no scene")
 def test_program_runs_beside_a_material_without_a_scene(tiny: Seen) -> None:
     elements = build_elements(tiny.table, tiny.hits, LATTICE)
     caches = random_caches(elements)
