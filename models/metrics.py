@@ -122,9 +122,7 @@ def smape(exposed: Image, reference: Image, epsilon: float = RELATIVE_EPSILON) -
 def st_lpips(display: Image, reference: Image, perceptual: Perceptual) -> float:
     """ST-LPIPS (`models.perceptual.StLpips`) of HxWx3 display images, H, W >= 32; 0 is identical."""
     _check_pair(display, reference)
-    pair = (
-        torch.from_numpy(image.astype(np.float32)).permute(2, 0, 1)[None] for image in (display, reference)
-    )
+    pair = (torch.from_numpy(image.astype(np.float32)).permute(2, 0, 1)[None] for image in (display, reference))
     with torch.inference_mode():
         return float(perceptual(*pair))
 
@@ -209,9 +207,7 @@ class Scores:
         return asdict(self)
 
 
-def score_frame(
-    frame: Image, reference: Image, exposure: float, perceptual: Perceptual | None = None
-) -> Scores:
+def score_frame(frame: Image, reference: Image, exposure: float, perceptual: Perceptual | None = None) -> Scores:
     """All scores of a frame; refused (None) when it holds a non-finite value.
 
     Metrics absorb such values silently: FLIP takes NaN for black.
@@ -253,6 +249,4 @@ def _decibels(mean_square: float) -> float:
 def _check_pair(image: Image, reference: Image, *, min_size_px: int = 1) -> None:
     shape = image.shape
     if shape != reference.shape or len(shape) != 3 or shape[2] != 3 or min(shape[:2]) < min_size_px:
-        raise ShapeError(
-            f"images must both be HxWx3 with H, W >= {min_size_px}, got {shape} and {reference.shape}"
-        )
+        raise ShapeError(f"images must both be HxWx3 with H, W >= {min_size_px}, got {shape} and {reference.shape}")

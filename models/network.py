@@ -61,9 +61,7 @@ class NetworkConfig:
         if self.gbuffer_channels < 1:
             raise ConfigError(f"gbuffer_channels must be at least 1, got {self.gbuffer_channels}")
         if len(self.widths) != NUM_SCALES or any(w < 1 or w % CHANNEL_GRANULE for w in self.widths):
-            raise ConfigError(
-                f"widths must be {NUM_SCALES} positive multiples of {CHANNEL_GRANULE}, got {self.widths}"
-            )
+            raise ConfigError(f"widths must be {NUM_SCALES} positive multiples of {CHANNEL_GRANULE}, got {self.widths}")
         if self.fusion not in ("fuse", "concatenate"):
             raise ConfigError(f'fusion must be "fuse" or "concatenate", got {self.fusion!r}')
         if self.unshuffle not in (1, 2, 4):
@@ -119,9 +117,7 @@ class FusionNet(nn.Module):
         """
         self._check(ir, gbuffer)
         dtype, block = self.head.weight.dtype, self.config.unshuffle
-        skips = self.encoder(
-            F.pixel_unshuffle(ir.to(dtype), block), F.pixel_unshuffle(gbuffer.to(dtype), block)
-        )
+        skips = self.encoder(F.pixel_unshuffle(ir.to(dtype), block), F.pixel_unshuffle(gbuffer.to(dtype), block))
         output = F.pixel_shuffle(self.head(self.decoder(skips)), block).to(ir.dtype)
         return ir[:, :RADIANCE_CHANNELS] + output if self.config.residual else output
 
@@ -139,9 +135,7 @@ class FusionNet(nn.Module):
                 f"height and width must be multiples of {multiple}, got {height} x {width}; pad the inputs"
             )
         if gbuffer.shape[0] != ir.shape[0] or gbuffer.shape[2:] != ir.shape[2:]:
-            raise ShapeError(
-                f"gbuffer must match ir {tuple(ir.shape)} but for channels, got {tuple(gbuffer.shape)}"
-            )
+            raise ShapeError(f"gbuffer must match ir {tuple(ir.shape)} but for channels, got {tuple(gbuffer.shape)}")
 
 
 def num_parameters(network: nn.Module) -> int:

@@ -69,9 +69,7 @@ class StLpips(nn.Module):
         super().__init__()
         self.trunk = "alex" if _tensor(weights, "net.slice1.0.weight").shape[-1] == 11 else "vgg"
         self.slices = nn.ModuleList(_slices(self.trunk, weights))
-        self.calibration = nn.ParameterList(
-            _tensor(weights, f"lin{s}.model.1.weight") for s in range(len(self.slices))
-        )
+        self.calibration = nn.ParameterList(_tensor(weights, f"lin{s}.model.1.weight") for s in range(len(self.slices)))
         self.register_buffer("shift", _tensor(weights, "scaling_layer.shift"))
         self.register_buffer("scale", _tensor(weights, "scaling_layer.scale"))
         self.requires_grad_(False)
@@ -95,9 +93,7 @@ class StLpips(nn.Module):
             shapes = f"{tuple(x.shape)} and {tuple(y.shape)}"
             raise ShapeError(f"images must both be B,3,H,W with H, W >= {MIN_SIZE_PX}, got {shapes}")
         distance = x.new_zeros(x.shape[0])
-        for feature_x, feature_y, weight in zip(
-            self._features(x), self._features(y), self.calibration, strict=True
-        ):
+        for feature_x, feature_y, weight in zip(self._features(x), self._features(y), self.calibration, strict=True):
             difference = (feature_x - feature_y).square()
             distance = distance + (difference * weight).sum(dim=1).mean(dim=(1, 2))
         return distance
@@ -134,9 +130,7 @@ def _slices(trunk: str, weights: Mapping[str, Tensor]) -> Iterator[nn.Sequential
         for kind in kinds:
             name = f"net.slice{number}.{index}"
             if kind == "conv":
-                layers.append(
-                    _convolution(_tensor(weights, f"{name}.weight"), _tensor(weights, f"{name}.bias"))
-                )
+                layers.append(_convolution(_tensor(weights, f"{name}.weight"), _tensor(weights, f"{name}.bias")))
             elif kind == "blur":
                 layers.append(_blur(_tensor(weights, f"{name}.filt")))
             elif kind == "pool":

@@ -61,9 +61,7 @@ def reproject(
     seen = sample_bilinear(previous_position_world.astype(np.float64), x_px, y_px)
     eye = np.asarray(previous_to_world, dtype=np.float64)[:3, 3]
     miss = np.linalg.norm(seen - position_world, axis=-1)
-    valid &= miss <= tolerance * np.linalg.norm(
-        position_world - eye, axis=-1
-    )  # False for NaN: unseen or background
+    valid &= miss <= tolerance * np.linalg.norm(position_world - eye, axis=-1)  # False for NaN: unseen or background
 
     warped = sample_bilinear(previous_image, x_px, y_px)
     return np.where(valid[..., None], warped, 0.0).astype(previous_image.dtype), valid

@@ -99,9 +99,7 @@ def create_app(
         response_class=Response,
         responses=FRAME_RESPONSES,
     )
-    async def frame(
-        scene: str, request: FrameRequest, accept: Annotated[str | None, Header()] = None
-    ) -> Response:
+    async def frame(scene: str, request: FrameRequest, accept: Annotated[str | None, Header()] = None) -> Response:
         media_type = images.negotiate(accept)
         rendered = await rendering.render(scene, request.to_camera(max_pixels))
         start_s = time.perf_counter()

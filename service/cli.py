@@ -27,22 +27,14 @@ SceneArgument = Annotated[
     typer.Argument(help="a Mitsuba .xml, a .yaml, a mesh (.glb .gltf .obj .ply .stl), or tabletop or tiny"),
 ]
 StoreOption = Annotated[str, typer.Option("--store", help="folder that holds everything that is computed")]
-PresetOption = Annotated[
-    str, typer.Option("--preset", help="draft, balanced or reference: from fast to accurate")
-]
+PresetOption = Annotated[str, typer.Option("--preset", help="draft, balanced or reference: from fast to accurate")]
 ResolutionOption = Annotated[
     str | None, typer.Option("--resolution", help="WIDTHxHEIGHT in pixels; default: the scene's own")
 ]
-SetOption = Annotated[
-    list[str] | None, typer.Option("--set", help="key=value, one setting; may be given again")
-]
+SetOption = Annotated[list[str] | None, typer.Option("--set", help="key=value, one setting; may be given again")]
 JsonOption = Annotated[Path | None, typer.Option("--json", help="also write the result as JSON")]
-ReportOption = Annotated[
-    Path | None, typer.Option("--report", help="where the HTML report goes; default: the store")
-]
-PictureOption = Annotated[
-    Path | None, typer.Option("--picture", help="also write the first pictures as one PNG")
-]
+ReportOption = Annotated[Path | None, typer.Option("--report", help="where the HTML report goes; default: the store")]
+PictureOption = Annotated[Path | None, typer.Option("--picture", help="also write the first pictures as one PNG")]
 BENCHMARKS_PAGE = Path("docs/benchmarks.md")
 
 
@@ -197,9 +189,7 @@ def benchmark(
     preset: PresetOption = "draft",
     resolution: ResolutionOption = "256x256",
     assignments: SetOption = None,
-    size: Annotated[
-        str, typer.Option("--size", help="WIDTHxHEIGHT of the frame that is timed")
-    ] = "1920x1080",
+    size: Annotated[str, typer.Option("--size", help="WIDTHxHEIGHT of the frame that is timed")] = "1920x1080",
     repeats: Annotated[int, typer.Option("--repeats", min=1, help="timed rounds; medians count")] = 7,
     with_ablation: Annotated[bool, typer.Option("--ablate", help="also run the ablation (hours)")] = False,
 ) -> None:

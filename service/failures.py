@@ -16,9 +16,7 @@ def one_line(error: BaseException) -> str:
     """The error's message on one line, with the file's name where the system names one."""
     if isinstance(error, MemoryError):
         detail = " ".join(str(error).split())
-        return (
-            f"not enough memory{': ' + detail if detail else ''}; choose a smaller size or a smaller preset"
-        )
+        return f"not enough memory{': ' + detail if detail else ''}; choose a smaller size or a smaller preset"
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     return " ".join(str(error).split()) or type(error).__name__

@@ -46,9 +46,7 @@ def parse_look_at(text: str) -> tuple[list[float], list[float], list[float]]:
 def look_at_text(camera: "Camera") -> str:
     """A camera's pose as `parse_look_at` reads it, to six digits."""
     target = camera.origin + camera.forward
-    return ",".join(
-        f"{number + 0.0:.6g}" for vector in (camera.origin, target, camera.up) for number in vector
-    )
+    return ",".join(f"{number + 0.0:.6g}" for vector in (camera.origin, target, camera.up) for number in vector)
 
 
 def parse_overrides(assignments: list[str]) -> dict[str, str]:
@@ -78,9 +76,7 @@ def check_writable(path: Path, option: str) -> None:
     if path.is_dir():
         raise OptionError(f"{option} must name a file, got the folder {str(path)!r}")
     if not folder.is_dir():
-        raise OptionError(
-            f"{option} must lie in a folder that exists, got {str(path)!r}; create {str(folder)!r}"
-        )
+        raise OptionError(f"{option} must lie in a folder that exists, got {str(path)!r}; create {str(folder)!r}")
     if not os.access(folder, os.W_OK):
         raise OptionError(f"{option} must lie in a folder that may be written, got {str(path)!r}")
 

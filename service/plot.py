@@ -60,9 +60,7 @@ def best_trades(measured: Mapping[str, tuple[float, float]]) -> set[str]:
 def _time_ticks(low: float, high: float) -> list[float]:
     """Powers of ten times 1, 2 and 5 within [low, high]."""
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    return [
-        step * 10.0**decade for decade in decades for step in (1, 2, 5) if low <= step * 10.0**decade <= high
-    ]
+    return [step * 10.0**decade for decade in decades for step in (1, 2, 5) if low <= step * 10.0**decade <= high]
 
 
 def _psnr_ticks(low: float, high: float) -> list[float]:
@@ -119,10 +117,6 @@ def trade_plot(result: Mapping[str, Any]) -> TradePlot | None:
         points=points,
         x_ticks=tuple(Tick(x_of(ms), f"{ms:g}") for ms in _time_ticks(low_ms, high_ms)),
         y_ticks=tuple(Tick(y_of(psnr), f"{psnr:g}") for psnr in _psnr_ticks(low_db, high_db)),
-        frontier=" ".join(
-            f"{p.x:.1f},{p.y:.1f}" for p in sorted(points, key=lambda p: p.x) if p.is_best_trade
-        ),
-        reference_y=y_of(reference_db)
-        if reference_db is not None and low_db < reference_db < high_db
-        else None,
+        frontier=" ".join(f"{p.x:.1f},{p.y:.1f}" for p in sorted(points, key=lambda p: p.x) if p.is_best_trade),
+        reference_y=y_of(reference_db) if reference_db is not None and low_db < reference_db < high_db else None,
     )

@@ -66,9 +66,7 @@ def _http_error(_: Request, error: Exception) -> JSONResponse:
 
 def _unknown_error(_: Request, error: Exception) -> JSONResponse:
     """The traceback goes to the log (starlette raises on); the client learns that it was not its fault."""
-    return problem(
-        500, f"the service failed on this request ({type(error).__name__}); its log has the traceback"
-    )
+    return problem(500, f"the service failed on this request ({type(error).__name__}); its log has the traceback")
 
 
 def add_problem_handlers(app: FastAPI) -> None:

@@ -93,9 +93,7 @@ class RenderThread:
         max_open_scenes: the scene used longest ago is closed when one more is opened.
     """
 
-    def __init__(
-        self, make_backend: Callable[[], Backend], *, max_open_scenes: int = MAX_OPEN_SCENES
-    ) -> None:
+    def __init__(self, make_backend: Callable[[], Backend], *, max_open_scenes: int = MAX_OPEN_SCENES) -> None:
         self._make_backend = make_backend
         self._max_open_scenes = max_open_scenes
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="lightwell-render")

@@ -149,9 +149,7 @@ def render_report(evaluation: "Evaluation", *, command: str | None = None) -> st
         facts=_facts(result),
         remarks=remarks(result),
         settings=json.dumps(result.get("settings", {}), indent=2, default=str),
-        pictures=[
-            {"title": picture.title, "tiles": _tiles(picture, rows)} for picture in evaluation.pictures
-        ],
+        pictures=[{"title": picture.title, "tiles": _tiles(picture, rows)} for picture in evaluation.pictures],
         plot=plot.trade_plot(result),
         frame=plot,
         command=command,

@@ -67,9 +67,7 @@ class FrameRequest(_Strict):
     )
 
     camera: CameraPose
-    fov_deg: FiniteFloat = Field(
-        default=45.0, gt=0, lt=180, description="field of view across the width, degrees"
-    )
+    fov_deg: FiniteFloat = Field(default=45.0, gt=0, lt=180, description="field of view across the width, degrees")
     width: int = Field(default=640, ge=1, le=MAX_SIDE_PX, strict=True, description="pixels")
     height: int = Field(default=360, ge=1, le=MAX_SIDE_PX, strict=True, description="pixels")
 
@@ -84,8 +82,7 @@ class FrameRequest(_Strict):
 
         if self.width * self.height > max_pixels:
             raise FrameTooLargeError(
-                f"frame must have at most {max_pixels} pixels, got {self.width}x{self.height}; "
-                "choose a smaller size"
+                f"frame must have at most {max_pixels} pixels, got {self.width}x{self.height}; choose a smaller size"
             )
         pose = self.camera
         if pose.look_at is not None:

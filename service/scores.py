@@ -68,10 +68,7 @@ def is_below_reference(row: Row, column: Column, reference_error_db: float | Non
     """Whether a PSNR claims a smaller error than the reference's own noise (such rows are equal)."""
     number = value(row, column)
     return (
-        column.key == "psnr"
-        and number is not None
-        and reference_error_db is not None
-        and number > reference_error_db
+        column.key == "psnr" and number is not None and reference_error_db is not None and number > reference_error_db
     )
 
 
@@ -95,9 +92,7 @@ def best(rows: Iterable[Row], column: Column) -> float | None:
 def is_best(row: Row, column: Column, rows: Iterable[Row]) -> bool:
     """Whether the row holds the column's best value as written (equal texts are equally good)."""
     number, top = value(row, column), best(rows, column)
-    return (
-        number is not None and top is not None and column.pattern.format(number) == column.pattern.format(top)
-    )
+    return number is not None and top is not None and column.pattern.format(number) == column.pattern.format(top)
 
 
 def human_bytes(num_bytes: float) -> str:

@@ -19,9 +19,7 @@ def score_table(result: Mapping[str, Any]) -> RenderableType:
         result: an evaluation's result JSON.
     """
     rows = result["rows"]
-    table = Table(
-        title=f"{escape(result['scene'])}, {result['width']}x{result['height']}", title_style="bold"
-    )
+    table = Table(title=f"{escape(result['scene'])}, {result['width']}x{result['height']}", title_style="bold")
     table.add_column("frame", no_wrap=True)
     for column in scores.COLUMNS:
         table.add_column(f"{column.title} {column.arrow}", justify="right", no_wrap=True)
@@ -71,8 +69,7 @@ def plan_table(plan: Mapping[str, Any]) -> RenderableType:
     return Group(
         table,
         Text(
-            f"cost: {cost['paths']:.3g} paths, about {human_seconds(cost['seconds'])}, "
-            f"{human_bytes(cost['nbytes'])}",
+            f"cost: {cost['paths']:.3g} paths, about {human_seconds(cost['seconds'])}, {human_bytes(cost['nbytes'])}",
             style="bold",
         ),
     )

@@ -103,8 +103,7 @@ def create_array(files: FileTree, folder: str, group: zarr.Group, spec: ArraySpe
         stored = spec_of(open_array(group, spec.name))
         if stored != spec:
             raise CacheMismatchError(
-                f"array of {files.path(folder)} must stay {stored}, got {spec}; make what differs part of "
-                "the key"
+                f"array of {files.path(folder)} must stay {stored}, got {spec}; make what differs part of the key"
             ) from None
 
 

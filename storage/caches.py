@@ -74,8 +74,7 @@ class CacheSet:
         folder = layout.caches_folder(ref.folder)
         if not store.files.exists(folder):
             raise MissingUnitError(
-                f"cache set {ref} must be in store {store.url}, got no {store.files.path(folder)}; "
-                "run the bake first"
+                f"cache set {ref} must be in store {store.url}, got no {store.files.path(folder)}; run the bake first"
             )
         for name, entry in ((store.committed(ref) or {}).get("files") or {}).items():
             if problem := difference(store.files.read(f"{ref.folder}/{name}"), entry):
@@ -98,9 +97,7 @@ class CacheSet:
         """Bytes at rest: compressed chunks, metadata and markers."""
         return self.store.nbytes(self.ref)
 
-    def write_unit(
-        self, index: int, rows: Mapping[str, np.ndarray], record: Mapping[str, Any]
-    ) -> dict[str, Any]:
+    def write_unit(self, index: int, rows: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> dict[str, Any]:
         """Stores one bake unit, marker last. A unit that is already committed is left as it is.
 
         Args:

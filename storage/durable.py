@@ -60,9 +60,7 @@ class FileTree:
     def nbytes(self, relative: str) -> int:
         """Bytes of all files below a folder; 0 where it does not exist."""
         try:
-            return sum(
-                info["size"] for info in self.filesystem.find(self.path(relative), detail=True).values()
-            )
+            return sum(info["size"] for info in self.filesystem.find(self.path(relative), detail=True).values())
         except FileNotFoundError:
             return 0
 

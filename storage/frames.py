@@ -135,9 +135,7 @@ def _health(layer: np.ndarray) -> dict[str, int]:
 def _decode_part(part: OpenEXR.Part) -> tuple[str, np.ndarray]:
     name = part.header.get(_LAYER)
     if name is None:
-        raise FrameError(
-            f"part must have the attribute {_LAYER}, got {part.name()!r} without; use encode_frame"
-        )
+        raise FrameError(f"part must have the attribute {_LAYER}, got {part.name()!r} without; use encode_frame")
     arrays = {channel: content.pixels for channel, content in part.channels.items()}
     feature = FEATURES.get(name) or _generic(name, len(arrays))
     ordered = {channel: arrays[channel] for channel in _channels(feature)}

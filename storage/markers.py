@@ -43,9 +43,7 @@ def compose(own: Mapping[str, Any], record: Mapping[str, Any]) -> dict[str, Any]
     own = plain({**own, "created_unix_s": round(time.time(), 3)}, "marker")
     for name in own.keys() & fields.keys() - {"seed", "created_unix_s"}:
         if fields[name] != own[name]:
-            raise CanonicalError(
-                f"record[{name!r}] must be left to the store, got {fields[name]!r}; rename the field"
-            )
+            raise CanonicalError(f"record[{name!r}] must be left to the store, got {fields[name]!r}; rename the field")
     versions = {**_versions(), **fields.pop("versions", {})}
     if fields.get("seed") is None:  # None means "not given"; 0 is a real seed
         fields.pop("seed", None)

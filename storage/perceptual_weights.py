@@ -43,6 +43,4 @@ def _read(file: Path) -> dict[str, Tensor]:
     try:
         return torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # zip, pickle and torch each have their own
-        raise WeightsError(
-            f"{file} must be a torch state dict, got: {error}; reinstall {_PACKAGE}"
-        ) from error
+        raise WeightsError(f"{file} must be a torch state dict, got: {error}; reinstall {_PACKAGE}") from error

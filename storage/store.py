@@ -147,8 +147,7 @@ class Store:
         files = self._record(ref)["files"]
         if name not in files:
             raise MissingUnitError(
-                f"file must be one of {sorted(files)} in unit {ref} of {self.url}, got {name!r}; "
-                "check the name"
+                f"file must be one of {sorted(files)} in unit {ref} of {self.url}, got {name!r}; check the name"
             )
         data = self.files.read(layout.unit_file(ref.folder, name))
         problem = difference(data, files[name])

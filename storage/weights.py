@@ -50,16 +50,12 @@ def decode_network(weights: bytes, config: bytes) -> tuple[dict[str, Tensor], di
     try:
         described = json.loads(config)
         if described[_CHECKSUM] != sha256_hex(weights):
-            raise WeightsError(
-                "weights must match the SHA-256 in their JSON, got others; fetch both files of one run"
-            )
+            raise WeightsError("weights must match the SHA-256 in their JSON, got others; fetch both files of one run")
         return load(weights), described["config"]
     except (ValueError, KeyError, TypeError, SafetensorError) as error:
         if isinstance(error, WeightsError):
             raise
-        raise WeightsError(
-            f"network must be safetensors and JSON of ours, got: {error}; train it again"
-        ) from error
+        raise WeightsError(f"network must be safetensors and JSON of ours, got: {error}; train it again") from error
 
 
 def encode_checkpoint(obj: Any) -> bytes:
@@ -74,9 +70,7 @@ def encode_checkpoint(obj: Any) -> bytes:
     try:
         torch.save(obj, stream)
     except Exception as error:  # pickle raises AttributeError, TypeError, PicklingError, ...
-        raise WeightsError(
-            f"checkpoint must be plain data and tensors, got: {error}; use state_dict()"
-        ) from error
+        raise WeightsError(f"checkpoint must be plain data and tensors, got: {error}; use state_dict()") from error
     data = stream.getvalue()
     decode_checkpoint(data)
     return data

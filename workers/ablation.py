@@ -82,9 +82,7 @@ def run_ablation(scene: Scene, store: Store, settings: Settings, progress: Progr
 def _row(run: RunState, variant: Variant) -> dict[str, Any]:
     elements = run_elements(run)
     run_bake(run, elements)
-    program = QueryProgram(
-        run.scene.mi_scene, run.table, elements, load_caches(run, elements), run.settings.query
-    )
+    program = QueryProgram(run.scene.mi_scene, run.table, elements, load_caches(run, elements), run.settings.query)
     frames, paths = run.settings.frames, run.paths
     train_refs = run_render(run, paths.train, frames.train_spp, "render training frames")
     test_refs = run_render(run, paths.test, frames.test_spp, "render test references")

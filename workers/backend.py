@@ -60,9 +60,7 @@ def _system_libraries() -> Iterator[Path]:
 def find_llvm() -> Path | None:
     """The libLLVM to use: newest of the environment, else newest of the system, never below `MIN_LLVM`."""
     for candidates in (_environment_libraries(), _system_libraries()):
-        usable = {
-            path.resolve() for path in candidates if path.is_file() and (llvm_version(path) or 0) >= MIN_LLVM
-        }
+        usable = {path.resolve() for path in candidates if path.is_file() and (llvm_version(path) or 0) >= MIN_LLVM}
         if usable:
             return max(usable, key=lambda path: (llvm_version(path) or 0, str(path)))
     return None
@@ -109,8 +107,7 @@ def _start_variant() -> str:
     variant = os.environ.get("LIGHTWELL_VARIANT", VARIANTS[0])
     if variant not in VARIANTS:
         raise BackendError(
-            f"LIGHTWELL_VARIANT must be one of {', '.join(VARIANTS)}, got {variant!r}; "
-            f"unset it for {VARIANTS[0]}"
+            f"LIGHTWELL_VARIANT must be one of {', '.join(VARIANTS)}, got {variant!r}; unset it for {VARIANTS[0]}"
         )
     if variant.startswith("llvm"):
         select_llvm()
@@ -122,9 +119,7 @@ def _start_variant() -> str:
         mitsuba.set_variant(variant)
     except Exception as error:  # Mitsuba raises bare exceptions
         line = str(error).strip().splitlines()[-1:] or ["no reason given"]
-        raise BackendError(
-            f"variant {variant} must start, got: {line[0]}; check its driver or library"
-        ) from error
+        raise BackendError(f"variant {variant} must start, got: {line[0]}; check its driver or library") from error
     return variant
 
 

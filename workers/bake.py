@@ -12,8 +12,8 @@ import numpy as np
 
 from storage.caches import ArraySpec, CacheSet
 from storage.store import UnitRef
-from workers.cache_filter import filter_diffuse, filter_directional
 from workers.bake_kernels import Batch, bake_diffuse, bake_directional
+from workers.cache_filter import filter_diffuse, filter_directional
 from workers.element_stage import elements_ref
 from workers.elements import ElementSet
 from workers.errors import WorkerError

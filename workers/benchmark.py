@@ -146,9 +146,7 @@ class PrimaryRays:
         self.scene = mi_scene
         self._replay = dr.freeze(self._program, state_fn=lambda *_: self.scene)
 
-    def _program(
-        self, device: DeviceCamera, width: int, height: int
-    ) -> "tuple[mi.Float, mi.Point2f, mi.UInt32]":
+    def _program(self, device: DeviceCamera, width: int, height: int) -> "tuple[mi.Float, mi.Point2f, mi.UInt32]":
         lane = dr.arange(mi.UInt32, width * height)
         ray = device.ray(mi.Float(lane % width) + 0.5, mi.Float(lane // width) + 0.5, width, height)
         hit = self.scene.ray_intersect_preliminary(ray, coherent=True)
@@ -190,9 +188,7 @@ def network_rate(reconstructor: Reconstructor, width: int, height: int, seconds:
 # ------------------------------------------------- the bake ------------------------------------------------
 
 
-def bake_throughput(
-    run: RunState, repeats: int = 5, *, lanes_per_launch: int = LANES_PER_LAUNCH
-) -> dict[str, Any]:
+def bake_throughput(run: RunState, repeats: int = 5, *, lanes_per_launch: int = LANES_PER_LAUNCH) -> dict[str, Any]:
     """Paths a second of each lobe's bake, and of Mitsuba's own `path` integrator at the same depth.
 
     Whole units, evenly spaced over the scene, as many as one launch of the bake holds; the path tracer
@@ -228,18 +224,14 @@ def _bake_methods(
     """The bake's kernels on a launch each, and the paths of those launches."""
     cache, mi_scene, table, depth = run.settings.cache, run.scene.mi_scene, run.table, run.scene.max_depth
     grid, exitant = (cache.azimuth, cache.polar), cache.lobes == "exitant"
-    diffuse_spp, directional_spp = (
-        -(-spp // cache.passes) for spp in (cache.diffuse_spp, cache.directional_spp)
-    )
+    diffuse_spp, directional_spp = (-(-spp // cache.passes) for spp in (cache.diffuse_spp, cache.directional_spp))
     methods: dict[str, Callable[[int], object]] = {}
     paths: dict[str, int] = {}
     if not exitant and elements.num_elements:
         every = np.arange(elements.num_elements)
         diffuse = spread_batch(every, cache.elements_per_unit, diffuse_spp, lanes_per_launch)
         paths["diffuse"] = len(diffuse.element) * diffuse_spp
-        methods["diffuse"] = lambda index: bake_diffuse(
-            mi_scene, table, elements, diffuse, diffuse_spp, index, depth
-        )
+        methods["diffuse"] = lambda index: bake_diffuse(mi_scene, table, elements, diffuse, diffuse_spp, index, depth)
     if len(elements.glossy):
         lanes = cache.azimuth * cache.polar * directional_spp
         directional = spread_batch(elements.glossy, cache.elements_per_unit, lanes, lanes_per_launch)
@@ -250,9 +242,7 @@ def _bake_methods(
     return methods, paths
 
 
-def spread_batch(
-    owners: np.ndarray, elements_per_unit: int, lanes_per_element: int, lanes_per_launch: int
-) -> Batch:
+def spread_batch(owners: np.ndarray, elements_per_unit: int, lanes_per_element: int, lanes_per_launch: int) -> Batch:
     """Whole units, evenly spaced, as many as fit one launch (at least one).
 
     Args:

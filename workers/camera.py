@@ -89,8 +89,7 @@ class Camera:
         rotation = matrix[:3, :3]
         if not np.allclose(rotation.T @ rotation, np.eye(3), atol=_ORTHONORMAL_TOLERANCE):
             raise CameraError(
-                f"camera to_world must have orthonormal axes, got {rotation.round(4).tolist()}; "
-                "remove scale and shear"
+                f"camera to_world must have orthonormal axes, got {rotation.round(4).tolist()}; remove scale and shear"
             )
         if isinstance(self.fov_deg, bool) or not isinstance(self.fov_deg, int | float | np.number):
             raise CameraError(f"camera fov_deg must be a number of degrees, got {self.fov_deg!r}")
@@ -120,9 +119,7 @@ class Camera:
         left = np.cross(up, forward)
         length = float(np.linalg.norm(left))
         if length <= 1e-9 * float(np.linalg.norm(up)):
-            raise CameraError(
-                f"camera up must not be zero or parallel to the view direction, got {up.tolist()}"
-            )
+            raise CameraError(f"camera up must not be zero or parallel to the view direction, got {up.tolist()}")
         left = left / length
         to_world = np.eye(4)
         to_world[:3, :4] = np.column_stack([left, np.cross(forward, left), forward, origin])

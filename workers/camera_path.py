@@ -160,9 +160,7 @@ def _generated_paths(scene: Scene, base: Camera, distance: float, num_path: int,
             break
     reach = float((amplitude * scale).max()) / distance
     if reach < 0.5 * max(AMPLITUDE):
-        notes.append(
-            f"camera path shrunk to {reach:.1%} of the median distance: surfaces are close to the view"
-        )
+        notes.append(f"camera path shrunk to {reach:.1%} of the median distance: surfaces are close to the view")
     return path, test, notes
 
 
@@ -194,9 +192,7 @@ def _curve_b(angle: Floats, phases: Floats) -> Floats:
 def _target_curve(angle: Floats, phases: Floats) -> Floats:
     """[poses, 3] where the point looked at wanders, in units of its amplitude: left and up only."""
     start = np.stack([np.sin(phases[0]), np.sin(phases[1]), 0.0])
-    return (
-        np.stack([np.sin(2 * angle + phases[0]), np.sin(angle + phases[1]), 0 * angle], axis=1) - 0.5 * start
-    )
+    return np.stack([np.sin(2 * angle + phases[0]), np.sin(angle + phases[1]), 0 * angle], axis=1) - 0.5 * start
 
 
 def _test_path(base: Camera, distance: float, amplitude: Floats, path: list[Camera], num_test: int,
@@ -252,9 +248,7 @@ def _strayed(scene: Scene, keyframes: list[Camera], distance: float, num_test: i
     """The keyframes' spline between A's samples, moved off it as far as surfaces allow."""
     times = (np.arange(num_test) + 0.5) / max(num_test, 1)
     along = spline(keyframes, times)
-    stray = (
-        KEYFRAME_TEST_AMPLITUDE * distance * _curve_b(2 * np.pi * times, rng.uniform(0, 2 * np.pi, size=3))
-    )
+    stray = KEYFRAME_TEST_AMPLITUDE * distance * _curve_b(2 * np.pi * times, rng.uniform(0, 2 * np.pi, size=3))
     if not along:
         return along
     room = np.clip(clearance(scene, positions(along)) - CLEARANCE * distance, 0, None).min()
@@ -269,9 +263,7 @@ def _strayed(scene: Scene, keyframes: list[Camera], distance: float, num_test: i
 
 def _all_clear(scene: Scene, base: Camera, cameras: list[Camera], margin: float) -> bool:
     origins = positions(cameras)
-    return bool(reachable(scene, base.origin, origins).all()) and bool(
-        (clearance(scene, origins) >= margin).all()
-    )
+    return bool(reachable(scene, base.origin, origins).all()) and bool((clearance(scene, origins) >= margin).all())
 
 
 def _domain(path: list[Camera], test: list[Camera], distance: float) -> tuple[float, float]:

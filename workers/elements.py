@@ -180,9 +180,7 @@ def _plain_lattice(table: SurfaceTable, hits: Hits, level: int, max_edge_fractio
     return located.with_levels(np.full(num_patches, level, np.uint32), np.zeros(num_patches))
 
 
-def _touched(
-    patches: PatchTable, patch: np.ndarray, b1: np.ndarray, b2: np.ndarray, side: np.ndarray
-) -> np.ndarray:
+def _touched(patches: PatchTable, patch: np.ndarray, b1: np.ndarray, b2: np.ndarray, side: np.ndarray) -> np.ndarray:
     index, weight = locate_points(b1, b2, patches.patch_level[patch])
     point = (patches.patch_base[patch][:, None] + index) * 2 + side[:, None]
     return _distinct(point[weight > 0])

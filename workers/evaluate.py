@@ -184,7 +184,7 @@ def _positions(renderer: FrameRenderer, camera: Camera) -> np.ndarray:
     return np.ascontiguousarray(renderer.program.run(camera)[..., a:b])
 
 
-def _row(  # noqa: PLR0913
+def _row(
     name: str, frames: list[np.ndarray], references: list[np.ndarray], exposure: float,
     perceptual: Perceptual | None, cameras: list[Camera], positions: list[np.ndarray], milliseconds: float,
 ) -> dict[str, Any]:  # fmt: skip
@@ -219,9 +219,7 @@ def _temporal(
     return float(np.mean(differences)) if differences else None
 
 
-def _pictures(
-    frames: dict[str, list[np.ndarray]], references: list[np.ndarray], exposure: float
-) -> list[Picture]:
+def _pictures(frames: dict[str, list[np.ndarray]], references: list[np.ndarray], exposure: float) -> list[Picture]:
     pictures = []
     for index in range(min(len(references), MAX_PICTURES)):
         images = {name: frames[name][index] for name in PICTURE_METHODS if name in frames}

@@ -176,9 +176,7 @@ def _lattice_barycentrics(offset: np.ndarray, n: np.ndarray) -> tuple[np.ndarray
     return np.where(n == 0, 1 / 3, i / safe), np.where(n == 0, 1 / 3, j / safe)
 
 
-def _cell_of_patch(
-    cell: np.ndarray, m: np.ndarray, is_square: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _cell_of_patch(cell: np.ndarray, m: np.ndarray, is_square: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     j_square = cell // (2 * m)
     # Row j of a triangle starts at j (2 m - j).
     j_triangle = np.floor(m - np.sqrt(np.maximum(m * m - cell.astype(np.float64), 0.0))).astype(np.int64)

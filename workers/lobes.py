@@ -148,7 +148,7 @@ def specular_tint(
     return tint
 
 
-def reflectance_at(table, elements) -> np.ndarray:  # type: ignore[no-untyped-def]
+def reflectance_at(table, elements) -> np.ndarray:
     """rho_d at cache elements seen along their normal, float32 [n, 3] (to undo demodulation)."""
     si = table.interaction(elements.shape, elements.prim_local, elements.uv)
     sign = np.where(elements.side == 1, -1.0, 1.0).astype(np.float32)

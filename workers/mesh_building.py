@@ -144,9 +144,7 @@ def icosphere(radius: float, num_subdivisions: int) -> MeshArrays:
         points = np.concatenate([points, points[unique].sum(axis=1) / 2])
         a, b, c = faces.T
         ab, bc, ca = middle.T
-        faces = np.concatenate(
-            [np.stack(t, axis=1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
-        )
+        faces = np.concatenate([np.stack(t, axis=1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))])
     normals = points / np.linalg.norm(points, axis=1, keepdims=True)
     u = np.arctan2(normals[:, 2], normals[:, 0]) / (2 * np.pi) + 0.5
     v = np.arccos(np.clip(normals[:, 1], -1, 1)) / np.pi

@@ -85,11 +85,7 @@ def _metallic_roughness(material: Any, has_texcoords: bool) -> dict[str, Any]:
 
 
 def _emission(material: Any, has_texcoords: bool) -> dict[str, Any] | None:
-    factor = (
-        np.zeros(3)
-        if material.emissiveFactor is None
-        else np.asarray(material.emissiveFactor, dtype=np.float64)
-    )
+    factor = np.zeros(3) if material.emissiveFactor is None else np.asarray(material.emissiveFactor, dtype=np.float64)
     if factor.max() <= 0:
         return None
     image = material.emissiveTexture if has_texcoords else None

@@ -61,9 +61,7 @@ def trace(scene: Scene, camera: Camera, spp: int, seed: int, *, features: bool =
     mean = total / spp
     if not features:
         return TracedImage(np.ascontiguousarray(mean[..., :3], dtype=np.float32))
-    radiance, albedo, normal = (
-        np.ascontiguousarray(mean[..., i : i + 3], dtype=np.float32) for i in (0, 3, 6)
-    )
+    radiance, albedo, normal = (np.ascontiguousarray(mean[..., i : i + 3], dtype=np.float32) for i in (0, 3, 6))
     return TracedImage(radiance, np.clip(albedo, 0, 1), normal)
 
 

@@ -8,10 +8,11 @@ from typing import Any
 
 import torch
 
+from storage.caches import CacheSet
 from storage.store import Store, UnitRef
-from workers.bake import bake_refs, cache_nbytes, load_caches, run_bake
 from workers.backend import dr
-from workers.element_stage import run_elements
+from workers.bake import bake_refs, cache_nbytes, load_caches, run_bake
+from workers.element_stage import elements_ref, run_elements
 from workers.elements import ElementSet
 from workers.errors import WorkerError
 from workers.evaluate import Evaluation, Picture, run_evaluation
@@ -124,10 +125,21 @@ def _evaluate(
 
 
 def stage_seconds(run: RunState, elements: ElementSet, network_ref: UnitRef) -> dict[str, float]:
-    """Seconds of preprocessing by stage, from the records of the units, so that a resumed run tells them too."""
-    del elements
-    result = dict(run.seconds)
-    record = run.store.committed(network_ref)
-    if record is not None:
-        result.setdefault("train", float(record["seconds"]))
-    return result
+    """Seconds of preprocessing by stage, summed over the records of the units: a resumed run tells them too."""
+    frames, paths = run.settings.frames, run.paths
+    poses = {"train": (paths.train, frames.train_spp), "validation": (paths.validation, frames.train_spp),
+             "test": (paths.test, frames.test_spp)}  # fmt: skip
+    seconds = {"elements": _recorded(run, [elements_ref(run)])}
+    for lobe, ref in bake_refs(run, elements).items():
+        caches = CacheSet.open(run.store, ref)
+        records = [caches.unit_record(index) or {} for index in range(caches.num_units)]
+        seconds[f"bake {lobe}"] = sum(float(record.get("seconds", 0.0)) for record in records)
+    for name, (cameras, spp) in poses.items():
+        seconds[RENDER_STAGES[name]] = _recorded(run, [render_ref(run, camera, spp) for camera in cameras])
+    inputs = [inputs_ref(run, elements, camera) for camera in paths.train + paths.validation]
+    return seconds | {"query inputs": _recorded(run, inputs), "train": _recorded(run, [network_ref])}
+
+
+def _recorded(run: RunState, refs: list[UnitRef]) -> float:
+    records = [run.store.committed(ref) or {} for ref in refs]
+    return sum(float(record.get("seconds", 0.0)) for record in records)

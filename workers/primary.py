@@ -62,9 +62,7 @@ class DeltaLobe:
     valid: "mi.Bool"
 
 
-def delta_lobes(
-    bsdf: "mi.BSDFPtr", si: "mi.SurfaceInteraction3f", active: "mi.Bool"
-) -> tuple[DeltaLobe, DeltaLobe]:
+def delta_lobes(bsdf: "mi.BSDFPtr", si: "mi.SurfaceInteraction3f", active: "mi.Bool") -> tuple[DeltaLobe, DeltaLobe]:
     """The delta lobes of a material without any randomness: (transmission or the only one, reflection).
 
     The second is invalid where the material has a single delta lobe.

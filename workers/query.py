@@ -64,9 +64,7 @@ class QueryProgram:
         self._state = (self._places, *self.shading.state())
         program = self._program if settings.weights == "barycentric" else self._paper_program
         self._program_unfrozen = program
-        self._replay = dr.freeze(
-            program, state_fn=lambda *_: self._state, limit=MAX_RECORDINGS, warn_after=1000
-        )
+        self._replay = dr.freeze(program, state_fn=lambda *_: self._state, limit=MAX_RECORDINGS, warn_after=1000)
 
     def run(self, camera: Camera) -> np.ndarray:
         """Queries one frame.
@@ -202,9 +200,7 @@ class QueryProgram:
             albedo += dr.select(active, beta * shaded.albedo, 0.0)
             covered += dr.select(active, weight * shaded.covered, 0.0)
             asked += dr.select(active, weight * shaded.asked, 0.0)
-            active &= (
-                si.is_valid() & has(shaded.bits, LobeClass.DELTA) & (depth + 1 < self.settings.max_chain)
-            )
+            active &= si.is_valid() & has(shaded.bits, LobeClass.DELTA) & (depth + 1 < self.settings.max_chain)
             first, second = delta_lobes(si.bsdf(), si, active)
             wo, lobe_weight, valid = dominant_lobe(first, second)
             ray = si.spawn_ray(si.to_world(wo))

@@ -222,9 +222,7 @@ class _Query:
             if np.any(go):
                 yield self.chain(hits, lobe.wo, throughput, go)
 
-    def chain(
-        self, hits: HitRecords, wo: "mi.Vector3f", beta: np.ndarray, go: np.ndarray
-    ) -> tuple[np.ndarray, ...]:
+    def chain(self, hits: HitRecords, wo: "mi.Vector3f", beta: np.ndarray, go: np.ndarray) -> tuple[np.ndarray, ...]:
         """Follows the likelier delta lobe of every later hit, at most `max_chain` segments."""
         radiance, albedo = np.zeros_like(beta), np.zeros_like(beta)
         baked, asked = np.zeros(len(beta)), np.zeros(len(beta))
@@ -282,9 +280,7 @@ def query_reference(
     if settings.weights == "barycentric":
         n = settings.samples
         walks = [
-            query.walk(*camera_rays(camera, x + (i + 0.5) / n, y + (j + 0.5) / n))
-            for j in range(n)
-            for i in range(n)
+            query.walk(*camera_rays(camera, x + (i + 0.5) / n, y + (j + 0.5) / n)) for j in range(n) for i in range(n)
         ]
         radiance = np.mean([walk["ir"] for walk in walks], axis=0)
     else:
@@ -296,9 +292,7 @@ def query_reference(
     baked, asked = (np.sum([walk[name] for walk in walks], axis=0) for name in ("baked", "asked"))
     with np.errstate(invalid="ignore"):
         coverage = np.where(asked > 0, baked / asked, 1.0)[:, None]
-    image = {
-        name: np.mean([walk[name] for walk in walks], axis=0) for name in ("normal", "albedo", "distance")
-    }
+    image = {name: np.mean([walk[name] for walk in walks], axis=0) for name in ("normal", "albedo", "distance")}
     image |= {"ir": radiance, "coverage": coverage, "position": walks[0]["position"]}
     return {name: value.reshape(camera.height, camera.width, -1) for name, value in image.items()}
 

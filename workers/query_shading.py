@@ -48,9 +48,7 @@ class Shaded:
 class CacheShading:
     """Caches of one scene in device memory."""
 
-    def __init__(
-        self, mi_scene: "mi.Scene", table: SurfaceTable, elements: ElementSet, caches: CacheArrays
-    ) -> None:
+    def __init__(self, mi_scene: "mi.Scene", table: SurfaceTable, elements: ElementSet, caches: CacheArrays) -> None:
         self.scene, self.table = mi_scene, table
         self.demodulated, self.exitant = caches.demodulated, caches.exitant
         self.union = table.lobe_union

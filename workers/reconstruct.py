@@ -81,7 +81,7 @@ class Reconstructor:
         self.encoding = encoding
         self.device = next(network.parameters()).device
         self.config: NetworkConfig = network.config
-        self._fp32 = network.eval().to(memory_format=torch.channels_last)
+        self._fp32 = channels_last(network.eval())
         self._precision, self._compile = precision, compile
         self._chosen: dict[tuple[int, int], Any] = {}
         self.choices: dict[str, str] = {}
@@ -119,7 +119,7 @@ class Reconstructor:
     def _bf16(self) -> FusionNet:
         network = FusionNet(self.config).to(self.device)
         network.load_state_dict(self._fp32.state_dict())
-        return network.eval().to(dtype=torch.bfloat16, memory_format=torch.channels_last)
+        return channels_last(network.eval().to(torch.bfloat16))
 
     def _passes_gate(self, inputs: list[Tensor]) -> bool:
         exposure = self.encoding.exposure
@@ -128,6 +128,14 @@ class Reconstructor:
         if not all(np.isfinite(frame).all() for frame in frames):
             return False
         return psnr(tone_map(frames[1], exposure), tone_map(frames[0], exposure)) >= BF16_GATE_DB
+
+
+def channels_last(network: FusionNet) -> FusionNet:
+    """Lays convolution weights out for channels-last input, in place."""
+    for parameter in network.parameters():
+        if parameter.dim() == 4:
+            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+    return network
 
 
 def _seconds(network: Any, inputs: list[Tensor]) -> float:

@@ -54,8 +54,8 @@ def _render_frame(run: RunState, ref: UnitRef, camera: Camera, spp: int) -> None
         radiance = np.where(finite, image.radiance, 0.0).astype(np.float64)
         total += radiance
         square += radiance**2
-        albedo += image.albedo
-        normal += image.normal
+        albedo += np.asarray(image.albedo, np.float64)
+        normal += np.asarray(image.normal, np.float64)
     if non_finite > 1e-3 * camera.width * camera.height * passes:
         raise WorkerError(
             f"ground truth must be finite, got {non_finite} NaN or Inf pixels; look for NaN in the scene's textures"

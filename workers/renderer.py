@@ -70,9 +70,7 @@ class FrameRenderer:
         run, network_ref = open_run(store, entry, progress or Progress())
         network, encoding = load_network(run, network_ref)
         elements = run_elements(run)
-        program = QueryProgram(
-            run.scene.mi_scene, run.table, elements, load_caches(run, elements), run.settings.query
-        )
+        program = QueryProgram(run.scene.mi_scene, run.table, elements, load_caches(run, elements), run.settings.query)
         precision = run.settings.train.precision
         renderer = cls(program, Reconstructor(network, encoding, precision=precision, compile=compile))
         if warm_up:

@@ -173,9 +173,7 @@ def _read(source: str | Path) -> tuple[str, SceneDraft]:
     if builtin in BUILTIN_SCENES and not Path(str(source)).is_file():
         return builtin, read_builtin(builtin)
     if str(source).startswith("builtin:"):
-        raise SceneError(
-            f"built-in scene must be one of {', '.join(sorted(BUILTIN_SCENES))}, got {builtin!r}"
-        )
+        raise SceneError(f"built-in scene must be one of {', '.join(sorted(BUILTIN_SCENES))}, got {builtin!r}")
     path = Path(source)
     if path.is_dir():
         path = path / "scene.xml"

@@ -18,9 +18,7 @@ def check_scene(scene: Any, what: str) -> list[str]:
         raise SceneError(f"{what} must hold at least one shape, got none; add geometry")
     degenerate = sum(_check_mesh(shape, what) for shape in shapes if shape.is_mesh())
     if not scene.emitters():
-        raise SceneError(
-            f"{what} must hold a light, got none; add an emitter (area, constant, envmap, point, ...)"
-        )
+        raise SceneError(f"{what} must hold a light, got none; add an emitter (area, constant, envmap, point, ...)")
     notes = []
     if degenerate:
         notes.append(f"{degenerate} triangles have no area: nothing is cached on them")
@@ -36,13 +34,9 @@ def _check_mesh(mesh: Any, what: str) -> int:
     faces = np.array(mesh.faces_buffer()).reshape(-1, 3)
     if not np.isfinite(positions).all():
         bad = int((~np.isfinite(positions).all(axis=1)).sum())
-        raise SceneError(
-            f"{what}: mesh {name} must have finite vertices, got {bad} with NaN or Inf; repair it"
-        )
+        raise SceneError(f"{what}: mesh {name} must have finite vertices, got {bad} with NaN or Inf; repair it")
     if int(faces.max()) >= len(positions):
-        raise SceneError(
-            f"{what}: mesh {name} must index its {len(positions)} vertices, got {int(faces.max())}"
-        )
+        raise SceneError(f"{what}: mesh {name} must index its {len(positions)} vertices, got {int(faces.max())}")
     corners = positions[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     degenerate = int((np.linalg.norm(normals, axis=1) <= 0).sum())

@@ -45,9 +45,7 @@ def file_hash(path: Path) -> str:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise SceneError(
-            f"file {path.name} must be readable, got: {error.strerror}; check its permissions"
-        ) from error
+        raise SceneError(f"file {path.name} must be readable, got: {error.strerror}; check its permissions") from error
 
 
 def text_hash(text: str) -> str:

@@ -91,9 +91,7 @@ def _shapes(path: Path, what: str, notes: list[str]) -> tuple[dict[str, Any], Fl
             continue
         name = _unused_name(str(node), shapes)
         shapes[name], positions = _shape(name, geometry, np.asarray(transform), path, what, notes)
-        corners = np.stack(
-            [np.minimum(corners[0], positions.min(0)), np.maximum(corners[1], positions.max(0))]
-        )
+        corners = np.stack([np.minimum(corners[0], positions.min(0)), np.maximum(corners[1], positions.max(0))])
     if not shapes:
         raise SceneError(f"{what} must hold triangles, got none; export a triangle mesh")
     if skipped:
@@ -110,9 +108,7 @@ def _shape(name: str, geometry: trimesh.Trimesh, transform: Floats, path: Path, 
     vertices, faces = np.asarray(geometry.vertices, dtype=np.float64), np.asarray(geometry.faces)
     if not np.isfinite(vertices).all() or not np.isfinite(transform).all():
         bad = int((~np.isfinite(vertices).all(axis=1)).sum())
-        raise SceneError(
-            f"{what}: mesh {name} must have finite vertices, got {bad} with NaN or Inf; repair it"
-        )
+        raise SceneError(f"{what}: mesh {name} must have finite vertices, got {bad} with NaN or Inf; repair it")
     linear = transform[:3, :3]
     positions = vertices @ linear.T + transform[:3, 3]
     normals = _file_normals(geometry, linear)
@@ -193,9 +189,7 @@ def _gltf_files(path: Path, what: str) -> tuple[dict[str, Path], list[str]]:
     if missing:
         raise SceneError(f"{what}: file {missing[0]} must exist; put it beside the scene")
     notes = []
-    ignored = [
-        name for name in document.get("extensionsUsed", []) if name.startswith(_IGNORED_EXTENSIONS_START)
-    ]
+    ignored = [name for name in document.get("extensionsUsed", []) if name.startswith(_IGNORED_EXTENSIONS_START)]
     if ignored:
         notes.append(f"glTF extensions that are not read: {', '.join(sorted(ignored))}")
     if document.get("animations") or document.get("skins"):

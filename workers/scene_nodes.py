@@ -73,9 +73,7 @@ def resolve_files(state: Any, folders: list[Path], what: str) -> dict[str, Path]
         if "filename" not in node.props:
             continue
         written = str(node.props["filename"])
-        candidates = (
-            [Path(written)] if Path(written).is_absolute() else [folder / written for folder in folders]
-        )
+        candidates = [Path(written)] if Path(written).is_absolute() else [folder / written for folder in folders]
         path = next((candidate.resolve() for candidate in candidates if candidate.is_file()), None)
         if path is None:
             raise SceneError(
@@ -175,9 +173,7 @@ def sensor_pose(sensor: Any, what: str) -> tuple[NDArray[np.float64], list[str]]
     matrix = np.array(sensor.props["to_world"].matrix, dtype=np.float64).reshape(4, 4)
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)
     if not np.isfinite(matrix).all() or lengths.min() <= 0:
-        raise SceneError(
-            f"{what}: the sensor's to_world must be finite and invertible, got {matrix.tolist()}"
-        )
+        raise SceneError(f"{what}: the sensor's to_world must be finite and invertible, got {matrix.tolist()}")
     axes = matrix[:3, :3] / lengths
     left, _, right = np.linalg.svd(axes)
     pose = np.eye(4)
@@ -240,6 +236,4 @@ def instantiate(state: Any, what: str) -> Any:
     try:
         return mi.parser.instantiate(parser_config(), state)
     except Exception as error:
-        raise SceneError(
-            f"{what} must be a scene that Mitsuba can build, got: {first_line(error)}"
-        ) from error
+        raise SceneError(f"{what} must be a scene that Mitsuba can build, got: {first_line(error)}") from error

@@ -47,7 +47,5 @@ def _search_folder(folder: Path) -> Iterator[None]:
 def _spectrum_files(parsed: list[Path], folders: list[Path]) -> dict[str, Path]:
     """Spectra that the parser has read already: {name as written: path}."""
     names = [name for file in parsed for name in _SPECTRUM_FILE.findall(file.read_text(errors="replace"))]
-    found = {
-        name: next((folder / name for folder in folders if (folder / name).is_file()), None) for name in names
-    }
+    found = {name: next((folder / name for folder in folders if (folder / name).is_file()), None) for name in names}
     return {name: path for name, path in found.items() if path is not None}

@@ -57,9 +57,7 @@ def read_yaml(path: Path) -> SceneDraft:
     settings = document.get("settings") or {}
     if not isinstance(settings, dict):
         raise SceneError(f"{what}: key settings must be a mapping, got {settings!r}")
-    keyframes = {
-        key: _keyframes(camera.get(key), f"{what}: key camera.{key}") for key in sorted(_CAMERA_KEYS)
-    }
+    keyframes = {key: _keyframes(camera.get(key), f"{what}: key camera.{key}") for key in sorted(_CAMERA_KEYS)}
     plugins = {"type": "scene", **_convert(document["scene"], "scene", what)}
     state = parse_state(lambda config: mi.parser.parse_dict(config, plugins), what)
     files = resolve_files(state, [path.parent.resolve()], what)
@@ -84,9 +82,7 @@ def _load(path: Path, what: str) -> Any:
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         place = f" at line {mark.line + 1}, column {mark.column + 1}" if mark else ""
-        raise SceneError(
-            f"{what} must be valid YAML, got: {getattr(error, 'problem', error)}{place}"
-        ) from error
+        raise SceneError(f"{what} must be valid YAML, got: {getattr(error, 'problem', error)}{place}") from error
 
 
 def _check_keys(value: Any, known: Set[str], what: str, required: Set[str] = frozenset()) -> None:
@@ -94,9 +90,7 @@ def _check_keys(value: Any, known: Set[str], what: str, required: Set[str] = fro
         raise SceneError(f"{what} must be a mapping with the keys {', '.join(sorted(known))}, got {value!r}")
     unknown, missing = sorted(map(str, set(value) - known)), sorted(required - set(value))
     if unknown:
-        raise SceneError(
-            f"{what} must only have the keys {', '.join(sorted(known))}, got {', '.join(unknown)}"
-        )
+        raise SceneError(f"{what} must only have the keys {', '.join(sorted(known))}, got {', '.join(unknown)}")
     if missing:
         raise SceneError(f"{what} must have the key {', '.join(missing)}; add it")
 
@@ -111,9 +105,7 @@ def _convert(value: Any, key: str, what: str) -> Any:
             if not isinstance(child, str):
                 raise SceneError(f"{what}: key {key}.{child} must be text, got {child!r}; put it in quotes")
         if "type" not in value and key != "scene":
-            raise SceneError(
-                f"{what}: key {key} must have a type, got the keys {', '.join(sorted(value)) or 'none'}"
-            )
+            raise SceneError(f"{what}: key {key} must have a type, got the keys {', '.join(sorted(value)) or 'none'}")
         return {child: _convert(inner, f"{key}.{child}", what) for child, inner in value.items()}
     if isinstance(value, str):
         return float(value) if name not in _TEXT_KEYS and _EXPONENT.fullmatch(value) else value
@@ -143,9 +135,7 @@ def _transform(value: Any, what: str) -> Any:
     result = mi.ScalarTransform4f()
     for step in steps:
         if not isinstance(step, dict) or len(step) != 1 or next(iter(step)) not in _STEPS:
-            raise SceneError(
-                f"{what} must be one of {', '.join(sorted(_STEPS))} or a list of them, got {step!r}"
-            )
+            raise SceneError(f"{what} must be one of {', '.join(sorted(_STEPS))} or a list of them, got {step!r}")
         kind, argument = next(iter(step.items()))
         result = _STEPS[kind](argument, f"{what}.{kind}") @ result
     return result

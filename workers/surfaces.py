@@ -63,9 +63,7 @@ class SurfaceTable:
         registry = dr.reinterpret_array(mi.UInt32, si.shape)
         return dr.gather(mi.UInt32, self.index_of_registry, registry, active)
 
-    def interaction(
-        self, shape: np.ndarray, prim_local: np.ndarray, uv: np.ndarray
-    ) -> "mi.SurfaceInteraction3f":
+    def interaction(self, shape: np.ndarray, prim_local: np.ndarray, uv: np.ndarray) -> "mi.SurfaceInteraction3f":
         """Surface interactions at given places, without tracing a ray.
 
         Args:

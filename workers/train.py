@@ -3,7 +3,7 @@
 import dataclasses
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from storage.weights import decode_checkpoint, decode_network, encode_checkpoint
 from workers.errors import WorkerError
 from workers.inputs import load_inputs
 from workers.query import CHANNELS, NUM_CHANNELS
-from workers.reconstruct import GBUFFER_CHANNELS, Encoding
+from workers.reconstruct import GBUFFER_CHANNELS, Encoding, channels_last
 from workers.render import load_render
 from workers.run_state import RunState
 from workers.schedule import learning_rate
@@ -110,10 +110,10 @@ class Trainer:
         seed = run.seed(ref)
         torch.manual_seed(seed)
         self.config = NetworkConfig(
-            ir_channels=3, gbuffer_channels=GBUFFER_CHANNELS, widths=self.settings.widths,
+            ir_channels=3, gbuffer_channels=GBUFFER_CHANNELS, widths=tuple(self.settings.widths),  # type: ignore[arg-type]  # three, by the settings' own check
             fusion=self.settings.fusion, unshuffle=self.settings.unshuffle, residual=self.settings.residual,
         )  # fmt: skip
-        self.network = FusionNet(self.config).to(self.device, memory_format=torch.channels_last)
+        self.network = channels_last(FusionNet(self.config).to(self.device))
         self.optimizer = self._optimizer()
         self.loss, self.plain_loss = self._losses()
         self.rng = np.random.default_rng(seed)
@@ -142,9 +142,7 @@ class Trainer:
         gradient = settings.gradient_weight if settings.gradient_weight > 0 else None
         every = settings.perceptual_every if settings.l1_weight > 0 else 1
         transfer = self.encoding.transfer
-        config = LossConfig(
-            l1=settings.l1_weight, perceptual=settings.perceptual_weight * every, gradient=gradient
-        )
+        config = LossConfig(l1=settings.l1_weight, perceptual=settings.perceptual_weight * every, gradient=gradient)
         full = ReconstructionLoss(config, transfer=transfer, perceptual=perceptual)
         if perceptual is None or settings.l1_weight == 0:
             return full, full
@@ -367,5 +365,5 @@ def _encoding(train: Dataset, curve: str) -> Encoding:
     exposure = exposure_from_luminance([luminance(frame) for frame in targets])
     a = CHANNELS["distance"][0]
     farthest = float(train.features[..., a].max())
-    name = "log1p" if curve == "log1p" else "mu-law"
+    name: Literal["log1p", "mu-law"] = "log1p" if curve == "log1p" else "mu-law"
     return Encoding(exposure, farthest if farthest > 0 else 1.0, Transfer(curve=name))

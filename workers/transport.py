@@ -90,9 +90,7 @@ def incident_radiance(scene: "mi.Scene", start: PathStart, rng: "mi.PCG32", max_
 
         # ------------------------------ Next-event estimation ------------------------------
         nee = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        ds, radiance = scene.sample_emitter_direction(
-            si, mi.Point2f(rng.next_float32(), rng.next_float32()), True, nee
-        )
+        ds, radiance = scene.sample_emitter_direction(si, mi.Point2f(rng.next_float32(), rng.next_float32()), True, nee)
         nee &= ds.pdf != 0.0
         wo = si.to_local(ds.d)
 

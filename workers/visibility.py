@@ -123,9 +123,7 @@ def _next_rays(table, si, depth):
     bits = dr.gather(mi.UInt32, table.lobe_bits_dr, table.shape_index(si, valid), valid)
     a, b = delta_lobes(si.bsdf(), si, valid & has(bits, LobeClass.DELTA))
     if depth == 0:
-        options = [
-            (lobe.wo, lobe.valid & (lobe.pdf * dr.max(lobe.weight) > MIN_PROBABILITY)) for lobe in (a, b)
-        ]
+        options = [(lobe.wo, lobe.valid & (lobe.pdf * dr.max(lobe.weight) > MIN_PROBABILITY)) for lobe in (a, b)]
     else:
         wo, _, valid = dominant_lobe(a, b)
         options = [(wo, valid)]

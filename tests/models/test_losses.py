@@ -68,9 +68,7 @@ def test_weights_choose_the_terms(config: LossConfig, perceptual: bool, active: 
 def test_gradient_term_of_a_ramp_is_its_slope() -> None:
     """A ramp of slope s along x only: |difference| is s, 2s and 4s at the three scales, and 0 along y."""
     ramp = 0.1 * torch.arange(16.0).expand(1, 3, 16, 16)
-    assert multi_scale_gradient_l1(ramp, torch.zeros_like(ramp)).item() == pytest.approx(
-        0.1 * (1 + 2 + 4) / 6
-    )
+    assert multi_scale_gradient_l1(ramp, torch.zeros_like(ramp)).item() == pytest.approx(0.1 * (1 + 2 + 4) / 6)
 
 
 def test_gradient_term_ignores_a_constant_offset() -> None:
@@ -81,9 +79,7 @@ def test_gradient_term_ignores_a_constant_offset() -> None:
 def test_loss_of_black_and_blown_out_frames_has_a_finite_gradient() -> None:
     prediction = torch.cat((image(0.0), image(1e4))).requires_grad_()
     target = torch.rand(4, 3, 16, 16)
-    ReconstructionLoss(LossConfig(gradient=1.0), perceptual=MeanDifference())(prediction, target)[
-        "total"
-    ].backward()
+    ReconstructionLoss(LossConfig(gradient=1.0), perceptual=MeanDifference())(prediction, target)["total"].backward()
     assert prediction.grad is not None
     assert prediction.grad.isfinite().all()
 

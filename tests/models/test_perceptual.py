@@ -25,9 +25,7 @@ def tiny_weights(trunk: str, channels: int = 4) -> dict[str, torch.Tensor]:
             if kind == "conv":
                 size = next(kernels)
                 shape = (channels, in_channels, size, size)
-                weights[f"{name}.weight"] = torch.randn(shape, generator=generator) / (
-                    size * in_channels**0.5
-                )
+                weights[f"{name}.weight"] = torch.randn(shape, generator=generator) / (size * in_channels**0.5)
                 weights[f"{name}.bias"] = 0.1 * torch.ones(channels)
                 in_channels = channels
             elif kind == "blur":
@@ -67,10 +65,7 @@ def test_calibration_weights_scale_their_own_slice() -> None:
     x, y = waves(0.0), waves(1.0)
     parts = []
     for kept in range(5):
-        only = {
-            k: v * (k == f"lin{kept}.model.1.weight") if k.startswith("lin") else v
-            for k, v in weights.items()
-        }
+        only = {k: v * (k == f"lin{kept}.model.1.weight") if k.startswith("lin") else v for k, v in weights.items()}
         parts.append(StLpips(only)(x, y))
     assert all(part > 0.0 for part in parts)
     assert torch.allclose(sum(parts, torch.zeros(1)), StLpips(weights)(x, y), rtol=1e-5)
@@ -130,9 +125,7 @@ def test_distance_grows_with_noise(published: StLpips) -> None:
     noise = torch.randn(1, 3, 48, 40, generator=torch.Generator().manual_seed(5))
     clean = waves(0.0)
     with torch.inference_mode():
-        distances = [
-            published(clean, (clean + s * noise).clamp(0, 1)).item() for s in (0.0, 0.02, 0.06, 0.18)
-        ]
+        distances = [published(clean, (clean + s * noise).clamp(0, 1)).item() for s in (0.0, 0.02, 0.06, 0.18)]
     assert distances[0] == 0.0
     assert distances == sorted(distances)
     assert distances[1] > 0.0

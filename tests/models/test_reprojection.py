@@ -24,9 +24,7 @@ def camera(x: float = 0.0, yaw: float = 0.0) -> np.ndarray:
 def trace(to_world: np.ndarray, *, card: bool = False) -> np.ndarray:
     """Positions seen through every pixel centre: the plane z = 5, and a card z = 2.5, |x| < 0.5 before it."""
     row, column = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    local = np.stack(
-        ((0.5 * WIDTH - column) / FOCAL_PX, (0.5 * HEIGHT - row) / FOCAL_PX, np.ones_like(row)), -1
-    )
+    local = np.stack(((0.5 * WIDTH - column) / FOCAL_PX, (0.5 * HEIGHT - row) / FOCAL_PX, np.ones_like(row)), -1)
     direction, eye = local @ to_world[:3, :3].T, to_world[:3, 3]
     plane = eye + direction * ((PLANE_Z - eye[2]) / direction[..., 2:])
     near = eye + direction * ((CARD_Z - eye[2]) / direction[..., 2:])
@@ -84,10 +82,7 @@ def test_disoccluded_pixels_are_invalid() -> None:
     hidden = on_plane & (np.abs(position[..., 0] + 0.3) < 0.95)
     assert hidden.sum() > 50
     assert not valid[hidden].any()
-    assert (
-        valid[on_plane & (np.abs(position[..., 0] + 0.3) > 1.2) & (np.abs(position[..., 0]) < 2.4)].mean()
-        > 0.9
-    )
+    assert valid[on_plane & (np.abs(position[..., 0] + 0.3) > 1.2) & (np.abs(position[..., 0]) < 2.4)].mean() > 0.9
     assert np.allclose(warped[valid][:, 2], position[valid][:, 2], atol=0.06)
 
 
@@ -97,9 +92,7 @@ def test_background_and_masked_pixels_are_invalid() -> None:
     position[10, 10] = np.inf
     surface = np.ones((HEIGHT, WIDTH), dtype=bool)
     surface[20:] = False
-    warped, valid = reproject(
-        shade(trace(camera())), position, trace(camera()), camera(), FOV_DEG, surface=surface
-    )
+    warped, valid = reproject(shade(trace(camera())), position, trace(camera()), camera(), FOV_DEG, surface=surface)
     assert not valid[3:6, 4:8].any()
     assert not valid[10, 10]
     assert not valid[20:].any()

@@ -252,9 +252,7 @@ def test_page_holds_every_measurement_of_every_scene() -> None:
     assert "| bake | 1 min 30 s |" in hall and "| **all** | 11 min 30 s |" in hall
     assert "Caches 3.0 MiB, network 1.0 MiB." in hall
     times = section(hall, "Time of a 1920x1080 frame")
-    assert (
-        "| **whole frame** | 470.0 |" in times and "query with G-buffers, 2x2 (this run) | 120.0 |" in times
-    )
+    assert "| **whole frame** | 470.0 |" in times and "query with G-buffers, 2x2 (this run) | 120.0 |" in times
     assert "82.00 GFLOP at 234 GFLOP/s: 31 % of the bf16 peak" in times
     bake = section(hall, "Throughput of the bake")
     assert "| diffuse | 1.50 | 0.75 | 2,097,152 |" in bake and "| mi.render path | 2.00 | 1 |" in bake
@@ -278,9 +276,7 @@ def test_page_shows_the_ablation_with_its_own_command() -> None:
     own = {"command": "lightwell b", "commit": "fff", "machine": "other", "width": 64, "height": 64,
            "preset": "tiny", "rows": ABLATION_ROWS}  # fmt: skip
     ablation = section(render_page([make_record(ablation=own)]), "Ablation")
-    assert (
-        "64x64, preset tiny." in ablation and "lightwell b" in ablation and "Commit fff; other." in ablation
-    )
+    assert "64x64, preset tiny." in ablation and "lightwell b" in ablation and "Commit fff; other." in ablation
     assert "| paper, 1 ray | 23.00 | - | -6.00* | 0.9000* | 0.1000* | 2.5 M | 12.0 s | 2.0 KiB |" in ablation
     same = own | {key: make_record()[key] for key in ("command", "commit", "machine")}
     assert "```sh" not in section(render_page([make_record(ablation=same)]), "Ablation")
@@ -356,9 +352,7 @@ def invoke(*arguments: str) -> Result:
 
 def test_benchmark_measures_scenes_one_at_a_time_and_keeps_them_all(calls: Any, tmp_path: Path) -> None:
     url, page = str(tmp_path / "store"), tmp_path / "benchmarks.md"
-    invoke(
-        "benchmark", "--store", url, "-o", str(page), "--scene", "b.xml", "--size", "64x48", "--repeats", "2"
-    )
+    invoke("benchmark", "--store", url, "-o", str(page), "--scene", "b.xml", "--size", "64x48", "--repeats", "2")
     assert calls == [("run_scene", "b"), ("measure_scene", ((64, 48), 2))]
     invoke("benchmark", "--store", url, "-o", str(page), "--scene", "c.xml", "--scene", "a.xml")
     text = page.read_text()
@@ -382,9 +376,7 @@ def test_benchmark_keeps_the_run_when_its_ablation_fails(
         raise ZeroDivisionError
 
     monkeypatch.setattr(sys.modules["workers.ablation"], "run_ablation", fail)
-    request = BenchmarkRequest(
-        source="hall", store_url=store.url, preset="draft", resolution=None, ablate=True
-    )
+    request = BenchmarkRequest(source="hall", store_url=store.url, preset="draft", resolution=None, ablate=True)
     settings = Settings.preset_named("draft")
     with pytest.raises(ZeroDivisionError):
         measure(FakeScene(), store, settings, request, Progress())  # type: ignore[arg-type]
@@ -402,9 +394,7 @@ def test_benchmark_adds_the_ablation_when_asked(calls: Any, tmp_path: Path) -> N
 
 def test_benchmark_refuses_a_page_it_cannot_write_before_it_measures(calls: Any, tmp_path: Path) -> None:
     output = str(tmp_path / "missing" / "page.md")
-    result = CliRunner().invoke(
-        app, ["benchmark", "--store", str(tmp_path / "s"), "-o", output, "--scene", "a.xml"]
-    )
+    result = CliRunner().invoke(app, ["benchmark", "--store", str(tmp_path / "s"), "-o", output, "--scene", "a.xml"])
     assert result.exit_code == 2 and "--output must lie in a folder that exists" in result.stderr
     assert calls == []
 

@@ -46,9 +46,7 @@ def calls(monkeypatch: pytest.MonkeyPatch, evaluation: Any, backend: Any) -> lis
         scene = FakeScene(settings={"cache.polar": 5, "cache.azimuth": 6} if source == "asks.yaml" else {})
         return dataclasses.replace(scene, camera=scene.camera.resized(width or 24, height or 16))
 
-    def run_scene(
-        scene: Any, store: Store, settings: Any, progress: Any, *, camera_size: tuple[int, int]
-    ) -> Any:
+    def run_scene(scene: Any, store: Store, settings: Any, progress: Any, *, camera_size: tuple[int, int]) -> Any:
         calls.append(("run_scene", {"settings": settings, "size": camera_size, "store": store}))
         with progress.track("bake", 1):
             pass
@@ -111,9 +109,7 @@ def test_help_imports_neither_mitsuba_nor_torch() -> None:
     code = ("import sys\nfrom typer.testing import CliRunner\nfrom service.cli import app\n"
             "assert CliRunner().invoke(app, ['run', '--help']).exit_code == 0\n"
             "print([m for m in ('mitsuba', 'torch', 'fastapi') if m in sys.modules])")  # fmt: skip
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     assert done.stdout.strip() == "[]"
 
 
@@ -129,9 +125,7 @@ def test_run_writes_json_report_and_picture(calls: Any, store: str, tmp_path: Pa
     assert "bake" in result.stderr and "note: a light was added" in result.stderr
 
 
-def test_json_has_null_for_what_is_not_finite(
-    calls: Any, store: str, tmp_path: Path, evaluation: Any
-) -> None:
+def test_json_has_null_for_what_is_not_finite(calls: Any, store: str, tmp_path: Path, evaluation: Any) -> None:
     evaluation.result["rows"][0]["psnr"] = float("inf")
     evaluation.result["rows"][1]["psnr"] = np.float32("nan")
     result = invoke("run", "scene.xml", "--store", store, "--json", str(tmp_path / "out.json"))
@@ -157,9 +151,7 @@ def test_settings_come_from_preset_then_file_then_command_line(calls: Any, store
     assert settings.frames == workers.settings.Settings.preset_named("draft").frames
 
 
-def test_demo_ends_with_table_report_and_a_frame_request_that_works(
-    calls: Any, store: str, tmp_path: Path
-) -> None:
+def test_demo_ends_with_table_report_and_a_frame_request_that_works(calls: Any, store: str, tmp_path: Path) -> None:
     result = invoke("demo", "--store", store)
     assert result.exit_code == 0, result.output
     assert calls[0][1] == {"source": "tabletop", "width": 256, "height": 256}
@@ -207,9 +199,7 @@ def test_frame_of_a_scene_file_goes_by_its_digest(calls: Any, store: str, tmp_pa
     Store.open(store, create=True)
     file = tmp_path / "scene.xml"
     file.write_text("<scene/>")
-    result = invoke(
-        "frame", str(file), "--store", store, "--look-at", "0,1,5,0,1,0", "-o", str(tmp_path / "f.exr")
-    )
+    result = invoke("frame", str(file), "--store", store, "--look-at", "0,1,5,0,1,0", "-o", str(tmp_path / "f.exr"))
     assert result.exit_code == 0, result.output
     assert calls[-1] == ("open_renderer", {"name": "d1"})
 
@@ -224,9 +214,7 @@ def test_frame_of_a_scene_file_goes_by_its_digest(calls: Any, store: str, tmp_pa
         (["--json", "no/such/folder/out.json"], "--json must lie in a folder that exists"),
     ],
 )
-def test_bad_options_are_one_line_and_touch_nothing(
-    calls: Any, store: str, arguments: list[str], words: str
-) -> None:
+def test_bad_options_are_one_line_and_touch_nothing(calls: Any, store: str, arguments: list[str], words: str) -> None:
     assert_mistake(invoke("run", "scene.xml", "--store", store, *arguments), words)
     assert not Path(store).exists() and "run_scene" not in dict(calls)
 
@@ -275,9 +263,7 @@ def test_a_bug_keeps_its_traceback(calls: Any, store: str, monkeypatch: pytest.M
     assert isinstance(result.exception, ZeroDivisionError)
 
 
-def test_an_interrupt_is_130_and_says_what_is_kept(
-    calls: Any, store: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupt_is_130_and_says_what_is_kept(calls: Any, store: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupt(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
@@ -292,6 +278,4 @@ def test_serve_refuses_a_port_in_use(store: str) -> None:
     Store.open(store, create=True)
     with bind("127.0.0.1", 0) as taken:
         port = taken.getsockname()[1]
-        assert_mistake(
-            invoke("serve", "--store", store, "--port", str(port)), "choose another --host or --port"
-        )
+        assert_mistake(invoke("serve", "--store", store, "--port", str(port)), "choose another --host or --port")

@@ -78,9 +78,7 @@ def test_negotiate_follows_quality_and_specificity(accept: str | None, media_typ
     assert images.negotiate(accept) == media_type
 
 
-@pytest.mark.parametrize(
-    "accept", ["text/html", "image/webp", "*/*;q=0", "image/png;q=2", "image/png;q=x", ";"]
-)
+@pytest.mark.parametrize("accept", ["text/html", "image/webp", "*/*;q=0", "image/png;q=2", "image/png;q=x", ";"])
 def test_negotiate_refuses_what_it_cannot_write(accept: str) -> None:
     with pytest.raises(NotAcceptableError, match="image/png, image/jpeg, image/x-exr"):
         images.negotiate(accept)

@@ -16,9 +16,7 @@ def test_parse_size(text: str, size: tuple[int, int]) -> None:
     assert options.parse_size(text) == size
 
 
-@pytest.mark.parametrize(
-    "text", ["", "640", "640x", "x9", "0x5", "-1x5", "1.5x2", "1x2x3", "٣x٣", "9" * 5000 + "x1"]
-)
+@pytest.mark.parametrize("text", ["", "640", "640x", "x9", "0x5", "-1x5", "1.5x2", "1x2x3", "٣x٣", "9" * 5000 + "x1"])
 def test_parse_size_refuses(text: str) -> None:
     with pytest.raises(OptionError, match="--resolution must be WIDTHxHEIGHT"):
         options.parse_size(text, "--resolution")
@@ -29,9 +27,7 @@ def test_parse_look_at_reads_origin_target_up() -> None:
     assert options.parse_look_at("-1,0,1e3, 4,5,6") == ([-1, 0, 1000], [4, 5, 6], [0, 1, 0])
 
 
-@pytest.mark.parametrize(
-    "text", ["", "1,2,3", "1,2,3,4,5,6,7", "1,2,3,4,5,nan,0,1,0", "1,2,3,4,5,inf", "a,b,c,d,e,f"]
-)
+@pytest.mark.parametrize("text", ["", "1,2,3", "1,2,3,4,5,6,7", "1,2,3,4,5,nan,0,1,0", "1,2,3,4,5,inf", "a,b,c,d,e,f"])
 def test_parse_look_at_refuses(text: str) -> None:
     with pytest.raises(OptionError, match="--look-at must be 9 numbers"):
         options.parse_look_at(text)

@@ -122,9 +122,7 @@ def test_picture_order_ends_with_the_reference() -> None:
 
 
 def test_contact_sheet_sets_pictures_side_by_side(evaluation: Any) -> None:
-    sheet = np.asarray(
-        Image.open(io.BytesIO(contact_sheet(evaluation.pictures[0], ["ir", "reference"], gap_px=5)))
-    )
+    sheet = np.asarray(Image.open(io.BytesIO(contact_sheet(evaluation.pictures[0], ["ir", "reference"], gap_px=5))))
     assert sheet.shape == (16, 24 + 5 + 24, 3)
     assert (sheet[:, 24:29] == 255).all()
     assert sheet[8, 3].sum() > sheet[8, 32].sum()  # "ir" of the stand-in is four times as bright

@@ -15,9 +15,7 @@ LOOK_AT = {"origin": [0.0, 1.0, 5.0], "target": [0.0, 1.0, 0.0], "up": [0.0, 1.0
 
 
 def request(camera: Any = None, **values: Any) -> FrameRequest:
-    return FrameRequest.model_validate(
-        {"camera": {"look_at": LOOK_AT} if camera is None else camera, **values}
-    )
+    return FrameRequest.model_validate({"camera": {"look_at": LOOK_AT} if camera is None else camera, **values})
 
 
 def test_look_at_and_its_matrix_mean_the_same_camera() -> None:

@@ -225,9 +225,7 @@ def test_other_arrays_or_attributes_under_one_key_are_refused(store: Store, cach
         (0, {"unknown": np.zeros((4, 3), np.float32)}),
     ],
 )
-def test_write_unit_refuses_rows_that_do_not_fit(
-    caches: CacheSet, index: int, change: dict[str, Any]
-) -> None:
+def test_write_unit_refuses_rows_that_do_not_fit(caches: CacheSet, index: int, change: dict[str, Any]) -> None:
     with pytest.raises(CacheMismatchError):
         caches.write_unit(index, {**rows_of(0), **change}, {})
     assert caches.committed_units() == set()

@@ -20,9 +20,7 @@ def random_layer(channels: int, seed: int = 0) -> np.ndarray:
 
 
 def all_layers() -> dict[str, np.ndarray]:
-    return {
-        name: random_layer(len(feature.channels), i) for i, (name, feature) in enumerate(FEATURES.items())
-    }
+    return {name: random_layer(len(feature.channels), i) for i, (name, feature) in enumerate(FEATURES.items())}
 
 
 def test_every_layer_round_trips_at_its_own_precision() -> None:
@@ -145,8 +143,6 @@ def test_decode_refuses_what_is_no_frame(data: bytes, capfd: pytest.CaptureFixtu
 def test_decode_refuses_an_image_of_another_program() -> None:
     stream = io.BytesIO()
     channels = {"R": np.zeros((2, 2), np.float32)}
-    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels).write(
-        stream
-    )
+    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels).write(stream)
     with pytest.raises(FrameError, match="lightwellLayer"):
         decode_frame(stream.getvalue())

@@ -137,9 +137,7 @@ class StoreContract:
         with pytest.raises(PathNameError, match="file name must be"):
             store.commit(REF, {name: b""}, {})
 
-    @pytest.mark.parametrize(
-        "ref", [UnitRef("..", "a", "b"), UnitRef("d", "a/b", "k"), UnitRef("d", "a", "")]
-    )
+    @pytest.mark.parametrize("ref", [UnitRef("..", "a", "b"), UnitRef("d", "a/b", "k"), UnitRef("d", "a", "")])
     def test_commit_refuses_an_address_that_leaves_the_store(self, store: Store, ref: UnitRef) -> None:
         with pytest.raises(PathNameError, match="must be 1 to 128"):
             store.commit(ref, FILES, {})
@@ -277,9 +275,7 @@ class TestLocalStore(StoreContract):
         store.commit(REF, FILES, {})
         assert store.verify() == []
 
-    def test_failed_write_keeps_the_old_file(
-        self, store: Store, url: str, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_failed_write_keeps_the_old_file(self, store: Store, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
         def fail(*args: Any) -> None:
             raise OSError(errno.ENOSPC, "no space left")
 
@@ -335,9 +331,7 @@ class TestLocalStore(StoreContract):
             start = threading.Barrier(4)
             records: list[dict[str, Any]] = []
 
-            def work(
-                index: int, ref: UnitRef = ref, start: threading.Barrier = start, records: Any = records
-            ) -> None:
+            def work(index: int, ref: UnitRef = ref, start: threading.Barrier = start, records: Any = records) -> None:
                 start.wait()
                 files = {name: bytes([index]) * 50 for name in ("a", "b", "c")}
                 records.append(Store.open(url).commit(ref, files, {"by": index}))

@@ -143,9 +143,7 @@ def split(samples: Samples, spp: int = 512, repeats: int = 32) -> Split:
     irradiance, irradiance_error = moments(value.reshape(len(NAMES), repeats, 1, 3), 1)
     value = bake_directional(scene, table, elements, repeated(repeats, 9), GRID, 16, 0, -1, False)
     baked, baked_error = moments(value.reshape(len(NAMES), repeats, BINS, 3), 1)
-    radiance, delta, rho, tint = (
-        part.reshape(len(NAMES), BINS, spp, 3) for part in path_traced(samples, spp)
-    )
+    radiance, delta, rho, tint = (part.reshape(len(NAMES), BINS, spp, 3) for part in path_traced(samples, spp))
     left, error = moments((radiance - delta - rho * irradiance[:, :, None]) / tint, 2)
     error = np.sqrt(error**2 + baked_error**2 + ((rho / tint).mean(2) * irradiance_error) ** 2)
     return Split(radiance.mean(2), left, baked, error, tint.mean(2))
@@ -183,9 +181,7 @@ def path_traced(samples: Samples, spp: int) -> tuple[np.ndarray, ...]:
 
 def radiance_along(scene: "mi.Scene", rays: list[Any], count: int) -> np.ndarray:
     """What Mitsuba's own `path` integrator gives along rays, float64 [len(rays), count, 3]."""
-    origin, direction = (
-        np.concatenate([rows(ray[part], count) for ray in rays]).astype(np.float32) for part in (0, 1)
-    )
+    origin, direction = (np.concatenate([rows(ray[part], count) for ray in rays]).astype(np.float32) for part in (0, 1))
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(3, len(origin))
     ray = mi.RayDifferential3f(mi.Point3f(origin.T.copy()), mi.Vector3f(direction.T.copy()))
@@ -197,9 +193,7 @@ def radiance_along(scene: "mi.Scene", rays: list[Any], count: int) -> np.ndarray
 
 @pytest.mark.parametrize(
     "name",
-    [
-        name for name in NAMES
-    ],
+    [name for name in NAMES],
 )
 def test_lobes_sum_to_what_mitsuba_renders(split: Split, name: str) -> None:
     index = NAMES.index(name)
@@ -224,9 +218,7 @@ def test_materials_are_told_apart(split: Split) -> None:
 
 
 def directional(samples: Samples, batch: Batch, bake_pass: int = 0) -> np.ndarray:
-    return bake_directional(
-        samples.scene, samples.table, samples.elements, batch, GRID, 16, bake_pass, -1, False
-    )
+    return bake_directional(samples.scene, samples.table, samples.elements, batch, GRID, 16, bake_pass, -1, False)
 
 
 def diffuse(samples: Samples, batch: Batch, bake_pass: int = 0) -> np.ndarray:
@@ -239,9 +231,7 @@ def unit(elements: list[int], seed: int) -> Batch:
 
 
 def joined(*batches: Batch) -> Batch:
-    return Batch(
-        *(np.concatenate([getattr(b, name) for b in batches]) for name in ("element", "seed", "place"))
-    )
+    return Batch(*(np.concatenate([getattr(b, name) for b in batches]) for name in ("element", "seed", "place")))
 
 
 LIT = [NAMES.index(name) for name in ("roughplastic", "principled_half", "blend", "roughconductor")]

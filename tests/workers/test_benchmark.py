@@ -97,9 +97,7 @@ def test_matmul_rate_counts_a_multiply_add_as_two(monkeypatch: pytest.MonkeyPatc
     assert rate == pytest.approx(2 * 8**3 / 1e9)
 
 
-def test_other_load_is_what_is_busy_beside_this_process(
-    clock: Clock, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_load_is_what_is_busy_beside_this_process(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
     machine = SimpleNamespace(user=100.0, system=10.0, idle=0.0)
     own = SimpleNamespace(seconds=(5.0, 1.0, 0.0, 0.0))
     fake = SimpleNamespace(
@@ -202,9 +200,7 @@ def test_bake_throughput_counts_the_paths_of_both_lobes_and_of_mitsuba(run: RunS
     assert paths["directional"] == directional > 0
     assert paths[benchmark.PATH_TRACER] == pytest.approx(directional, abs=32 * 32 / 2)
     rates = result["paths_per_s"]
-    assert result["ratios"] == {
-        name: rates[name] / rates[benchmark.PATH_TRACER] for name in ("diffuse", "directional")
-    }
+    assert result["ratios"] == {name: rates[name] / rates[benchmark.PATH_TRACER] for name in ("diffuse", "directional")}
     assert json.loads(json.dumps(result)) == result
 
 

@@ -35,8 +35,7 @@ def test_builtin_digests_differ() -> None:
 def test_builtin_is_the_same_twice(name: str) -> None:
     scenes = [load_scene(name, width=4, height=4) for _ in range(2)]
     meshes = [
-        {shape.id(): np.array(shape.vertex_positions_buffer()) for shape in scene.mi_scene.shapes()}
-        for scene in scenes
+        {shape.id(): np.array(shape.vertex_positions_buffer()) for shape in scene.mi_scene.shapes()} for scene in scenes
     ]
     assert meshes[0].keys() == meshes[1].keys()
     assert all(np.array_equal(meshes[0][key], meshes[1][key]) for key in meshes[0])
@@ -46,9 +45,7 @@ def test_builtin_is_the_same_twice(name: str) -> None:
 def test_builtin_room_is_closed_and_lit(name: str) -> None:
     scene = load_scene(name, width=16, height=16)
     integrator = mi.load_dict({"type": "aov", "aovs": "t:depth", "i": {"type": "path", "max_depth": 4}})
-    image = np.array(
-        mi.render(scene.mi_scene, sensor=scene.make_sensor(scene.camera), integrator=integrator, spp=16)
-    )
+    image = np.array(mi.render(scene.mi_scene, sensor=scene.make_sensor(scene.camera), integrator=integrator, spp=16))
     assert np.isfinite(image).all()
     assert (image[..., 3] > 0).all(), "every ray meets a surface"
     assert 0.05 < image[..., :3].mean() < 2

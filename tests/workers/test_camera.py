@@ -81,9 +81,7 @@ def test_camera_refuses(change: dict, message: str) -> None:
         Camera(**{"to_world": np.eye(4), "fov_deg": 45.0, "width": 8, "height": 8, **change})
 
 
-@pytest.mark.parametrize(
-    "pose", [([0, 0, 0], [0, 0, 0], UP), ([0, 0, 0], [0, 1, 0], UP), ([0, 0], [0, 0, 1], UP)]
-)
+@pytest.mark.parametrize("pose", [([0, 0, 0], [0, 0, 0], UP), ([0, 0, 0], [0, 1, 0], UP), ([0, 0], [0, 0, 1], UP)])
 def test_look_at_refuses_poses_without_a_direction(pose: tuple) -> None:
     with pytest.raises(CameraError):
         Camera.look_at(*pose, 45, 8, 8)

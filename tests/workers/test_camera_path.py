@@ -24,9 +24,7 @@ def box_room(folder: Path, origin: str = "0,0,0.5") -> Scene:
     return load_scene(folder / "box.xml", width=32, height=32)
 
 
-def make(
-    scene: Scene, seed: int = 0, num_train: int = 36, num_validation: int = 4, num_test: int = 25
-) -> CameraPaths:
+def make(scene: Scene, seed: int = 0, num_train: int = 36, num_validation: int = 4, num_test: int = 25) -> CameraPaths:
     return camera_paths(
         scene,
         num_train=num_train,
@@ -39,9 +37,7 @@ def make(
 
 
 @pytest.fixture(scope="module", params=["generated", "keyframes", "strayed"])
-def case(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Scene, CameraPaths]:
+def case(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Scene, CameraPaths]:
     if request.param == "generated":
         scene = box_room(tmp_path_factory.mktemp("box"))
     else:

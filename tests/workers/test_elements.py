@@ -149,9 +149,7 @@ def test_vertex_and_triangle_modes_count_as_the_mesh_does() -> None:
     positions, faces = quad_grid(6)
     centres = positions[faces].mean(1)
     order = np.lexsort(np.round(triangles.position, 4).T)
-    np.testing.assert_allclose(
-        triangles.position[order], centres[np.lexsort(np.round(centres, 4).T)], atol=1e-5
-    )
+    np.testing.assert_allclose(triangles.position[order], centres[np.lexsort(np.round(centres, 4).T)], atol=1e-5)
 
 
 def test_long_edges_are_cut_for_the_papers_caches() -> None:

@@ -108,9 +108,7 @@ def test_diffuse_reflectance_is_the_albedo_of_the_diffuse_lobe(
 def test_coated_reflectance_is_the_hemispherical_one(bsdfs: Materials, name: str) -> None:
     """The probe at 60 degrees against the whole hemisphere under uniform light: within 1.5 %."""
     bsdf, count = bsdfs[name], 20_000
-    grid = np.stack(np.meshgrid((np.arange(200) + 0.5) / 200, (np.arange(100) + 0.5) / 100), -1).reshape(
-        -1, 2
-    )
+    grid = np.stack(np.meshgrid((np.arange(200) + 0.5) / 200, (np.arange(100) + 0.5) / 100), -1).reshape(-1, 2)
     light = mi.warp.square_to_cosine_hemisphere(mi.Point2f(np.ascontiguousarray(grid.T, np.float32)))
     for cosine in COSINES:
         si = seen_from(np.full(count, cosine, np.float32))

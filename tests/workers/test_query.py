@@ -149,9 +149,7 @@ def test_program_agrees_with_the_reference_behind_glass(vitrine: Seen, query: Qu
 def test_program_is_bit_identical_twice(tiny: Seen) -> None:
     elements = build_elements(tiny.table, tiny.hits, LATTICE)
     caches, query = random_caches(elements), QuerySettings(samples=2)
-    images = [
-        QueryProgram(tiny.scene, tiny.table, elements, caches, query).run(tiny.camera) for _ in range(2)
-    ]
+    images = [QueryProgram(tiny.scene, tiny.table, elements, caches, query).run(tiny.camera) for _ in range(2)]
     np.testing.assert_array_equal(images[0], images[1])
 
 
@@ -251,9 +249,7 @@ def test_stand_ins_count_only_where_nothing_was_baked(tiny: Seen) -> None:
     diffuse = np.full((count + 1, 3), 1.0, np.float32)
     diffuse[count] = 9.0
     caches = CacheArrays(diffuse, np.zeros((len(elements.glossy), POLAR, AZIMUTH, 3), np.float32))
-    image = layers(
-        QueryProgram(tiny.scene, tiny.table, poisoned, caches, QuerySettings(samples=1)).run(tiny.camera)
-    )
+    image = layers(QueryProgram(tiny.scene, tiny.table, poisoned, caches, QuerySettings(samples=1)).run(tiny.camera))
     with np.errstate(invalid="ignore", divide="ignore"):
         light = (image["ir"] / image["albedo"])[..., 0]
     plain = (image["ir"] < 6.0).all(-1) & (image["albedo"][..., 0] > 0.01)

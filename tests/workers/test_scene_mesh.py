@@ -19,9 +19,7 @@ def textured_quad() -> trimesh.Trimesh:
     """Upper half red, lower half blue, facing +Z."""
     image = np.zeros((16, 16, 3), np.uint8)
     image[:8, :, 0], image[8:, :, 2] = 255, 255
-    quad = trimesh.Trimesh(
-        [[-1, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]], [[0, 1, 2], [0, 2, 3]], process=False
-    )
+    quad = trimesh.Trimesh([[-1, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
     material = PBR(baseColorTexture=Image.fromarray(image), metallicFactor=0.0, roughnessFactor=1.0)
     quad.visual = trimesh.visual.TextureVisuals(uv=[[0, 0], [1, 0], [1, 1], [0, 1]], material=material)
     return quad
@@ -73,16 +71,12 @@ def test_light_and_camera_are_added_and_the_bounds_are_in_view(tmp_path: Path, s
     assert (local[:, 2] > 0).all() and (np.abs(local[:, :2] / local[:, 2:3]) < half).all()
     assert scene.camera.up[2] > 0.5, "Z is up in these files"
     path_tracer = mi.load_dict({"type": "path", "max_depth": 4})
-    image = np.array(
-        mi.render(scene.mi_scene, sensor=scene.make_sensor(scene.camera), integrator=path_tracer, spp=4)
-    )
+    image = np.array(mi.render(scene.mi_scene, sensor=scene.make_sensor(scene.camera), integrator=path_tracer, spp=4))
     assert np.isfinite(image).all() and image.mean() > 0.05
 
 
 def test_vertex_colours_become_linear_reflectance(tmp_path: Path) -> None:
-    quad = trimesh.Trimesh(
-        [[-1, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]], [[0, 1, 2], [0, 2, 3]], process=False
-    )
+    quad = trimesh.Trimesh([[-1, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
     quad.visual.vertex_colors = [188, 0, 255, 255]
     quad.export(tmp_path / "q.ply")
     np.testing.assert_allclose(albedo_at(load_scene(tmp_path / "q.ply"), 0.2, 0.5), [0.503, 0, 1], atol=2e-3)

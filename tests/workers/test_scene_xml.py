@@ -29,9 +29,7 @@ def write(folder: Path, *parts: str, name: str = "room.xml") -> Path:
 def write_ply(folder: Path, vertices: list, faces: list) -> str:
     text = TRIANGLE.format(n=len(vertices), m=len(faces))
     if not np.isfinite(vertices).all():
-        binary = (
-            text.replace("ascii", "binary_little_endian").encode() + np.array(vertices, dtype="<f4").tobytes()
-        )
+        binary = text.replace("ascii", "binary_little_endian").encode() + np.array(vertices, dtype="<f4").tobytes()
         binary += b"".join(b"\x03" + np.array(face, dtype="<i4").tobytes() for face in faces)
         (folder / "mesh.ply").write_bytes(binary)
         return PLY_SHAPE
@@ -56,9 +54,7 @@ def test_vertical_fov_is_converted_for_the_asked_size(tmp_path: Path) -> None:
     scene = load_scene(
         write(tmp_path, sensor('<string name="fov_axis" value="y"/>'), FLOOR, LIGHT), width=90, height=30
     )
-    assert scene.camera.fov_deg == pytest.approx(
-        np.degrees(2 * np.arctan(3 * np.tan(np.radians(20)))), rel=1e-5
-    )
+    assert scene.camera.fov_deg == pytest.approx(np.degrees(2 * np.arctan(3 * np.tan(np.radians(20)))), rel=1e-5)
     assert scene.camera.fov_y_deg == pytest.approx(40, rel=1e-5)
 
 
@@ -141,10 +137,7 @@ def test_thinlens_and_second_sensor_are_noted(tmp_path: Path) -> None:
 
 
 def test_near_clip_of_the_file_is_kept(tmp_path: Path) -> None:
-    assert (
-        load_scene(write(tmp_path, sensor('<float name="near_clip" value="2"/>'), FLOOR, LIGHT)).near_clip
-        == 2
-    )
+    assert load_scene(write(tmp_path, sensor('<float name="near_clip" value="2"/>'), FLOOR, LIGHT)).near_clip == 2
 
 
 def test_some_triangles_without_area_are_noted(tmp_path: Path) -> None:

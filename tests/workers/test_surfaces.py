@@ -30,9 +30,7 @@ LIGHT = {"type": "constant"}
 def load(shapes: dict[str, dict[str, Any]]) -> "mi.Scene":
     def mesh(name: str) -> Any:
         ball, bsdf = icosphere(0.6, 2), mi.load_dict({"type": "diffuse"})
-        return to_mitsuba(
-            name, ball.positions, ball.faces, normals=ball.normals, texcoords=ball.texcoords, bsdf=bsdf
-        )
+        return to_mitsuba(name, ball.positions, ball.faces, normals=ball.normals, texcoords=ball.texcoords, bsdf=bsdf)
 
     built: dict[str, Any] = {
         name: mesh(name) if shape["type"] == "mesh_ball" else dict(shape) for name, shape in shapes.items()
@@ -45,9 +43,7 @@ def rows(value: Any) -> np.ndarray:
     return np.array(value, dtype=np.float64).T
 
 
-def random_hits(
-    scene: "mi.Scene", count: int
-) -> "tuple[mi.PreliminaryIntersection3f, mi.SurfaceInteraction3f]":
+def random_hits(scene: "mi.Scene", count: int) -> "tuple[mi.PreliminaryIntersection3f, mi.SurfaceInteraction3f]":
     """Hits of rays between random points around the scene's box."""
     box = scene.bbox()
     low, high = np.array(box.min) - 0.5, np.array(box.max) + 0.5
@@ -126,9 +122,7 @@ def test_shape_index_names_the_shape_that_was_hit() -> None:
         assert np.array_equal(index == position, registry == own)
     assert len(np.unique(index)) > 4
     gathered = dr.reinterpret_array(mi.UInt32, table.shape_pointers).numpy()
-    assert [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s)).numpy()[0]) for s in table.shapes] == list(
-        gathered
-    )
+    assert [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s)).numpy()[0]) for s in table.shapes] == list(gathered)
 
 
 def test_primitives_and_edges_are_counted() -> None:

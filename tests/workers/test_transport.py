@@ -24,9 +24,7 @@ def grey(value: float) -> dict[str, Any]:
 class Probe:
     """Points on the shapes of a scene, baked many times with independent seeds."""
 
-    def __init__(
-        self, config: dict[str, Any], places: list[tuple[str, int, tuple[float, float], int]]
-    ) -> None:
+    def __init__(self, config: dict[str, Any], places: list[tuple[str, int, tuple[float, float], int]]) -> None:
         self.scene = mi.load_dict({"type": "scene", **config}, optimize=False)
         self.table = build_surface_table(self.scene)
         ids = [shape.id() for shape in self.table.shapes]
@@ -35,9 +33,7 @@ class Probe:
         uv = np.array([place[2] for place in places], np.float32)
         side = np.array([place[3] for place in places], np.uint8)
         position, normal, _ = surface_frame(self.table, shape, prim, uv, side)
-        self.elements: Any = SimpleNamespace(
-            shape=shape, prim_local=prim, uv=uv, normal=normal, position=position
-        )
+        self.elements: Any = SimpleNamespace(shape=shape, prim_local=prim, uv=uv, normal=normal, position=position)
         self.count = len(places)
 
     def batch(self, repeats: int, seed: int) -> Batch:
@@ -46,9 +42,7 @@ class Probe:
 
     def diffuse(self, max_depth: int, repeats: int = 32, spp: int = 64) -> tuple[np.ndarray, np.ndarray]:
         """(mean, standard error) of D at every place, float64 [places, 3]."""
-        value, _ = bake_diffuse(
-            self.scene, self.table, self.elements, self.batch(repeats, 11), spp, 0, max_depth
-        )
+        value, _ = bake_diffuse(self.scene, self.table, self.elements, self.batch(repeats, 11), spp, 0, max_depth)
         return moments(value.reshape(self.count, repeats, 3))
 
     def directional(
