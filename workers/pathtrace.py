@@ -9,6 +9,7 @@ from workers.backend import dr, mi
 from workers.camera import Camera
 from workers.scene import Scene
 
+FEATURE_SPP = 16
 SAMPLES_PER_LAUNCH = 1 << 24  # wavefront of one launch: a few GiB of state at most; more samples loop over seeds
 
 
@@ -28,41 +29,51 @@ class TracedImage:
 
 
 @lru_cache(maxsize=16)
-def _integrator(max_depth: int, features: bool) -> "mi.Integrator":
-    path = {"type": "path", "max_depth": max_depth}
-    if not features:
-        return mi.load_dict(path)
-    return mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal", "path": path})
+def _path(max_depth: int) -> "mi.Integrator":
+    return mi.load_dict({"type": "path", "max_depth": max_depth})
+
+
+@lru_cache(maxsize=1)
+def _features() -> "mi.Integrator":
+    return mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
 
 
 def trace(scene: Scene, camera: Camera, spp: int, seed: int, *, features: bool = False) -> TracedImage:
     """Path-traces one image with `scene.max_depth`; box filter, so the same seed gives the same bits.
+
+    Features are rendered apart: with the path integrator nested in `aov` the paths are traced twice (measured: 2.1
+    times the time of the path integrator alone, against 1.1 for both one after the other).
 
     Args:
         scene: the scene.
         camera: pose and size.
         spp: paths per pixel.
         seed: uint32; launches of a large image take the seeds that follow.
-        features: also return albedo and normal, averaged over the same samples.
+        features: also return albedo and normal, at most `FEATURE_SPP` samples a pixel.
     """
-    pixels = camera.width * camera.height
-    per_launch = max(1, min(spp, SAMPLES_PER_LAUNCH // pixels))
     sensor = scene.make_sensor(camera)
-    integrator = _integrator(scene.max_depth, features)
-    total, done = None, 0
+    radiance = _render(scene, sensor, camera, _path(scene.max_depth), spp, seed)
+    if not features:
+        return TracedImage(radiance)
+    layers = _render(scene, sensor, camera, _features(), min(spp, FEATURE_SPP), seed)
+    albedo, normal = (np.ascontiguousarray(layers[..., i : i + 3]) for i in (0, 3))
+    return TracedImage(radiance, np.clip(albedo, 0, 1), normal)
+
+
+def _render(
+    scene: Scene, sensor: "mi.Sensor", camera: Camera, integrator: "mi.Integrator", spp: int, seed: int
+) -> np.ndarray:
+    """Mean over launches that fit `SAMPLES_PER_LAUNCH`, float32 [height, width, channels]."""
+    per_launch = max(1, min(spp, SAMPLES_PER_LAUNCH // (camera.width * camera.height)))
+    total = np.zeros(1, np.float64)
+    done = 0
     while done < spp:
         count = min(per_launch, spp - done)
         launch_seed = (seed + done) % 2**32
         image = mi.render(scene.mi_scene, sensor=sensor, integrator=integrator, spp=count, seed=launch_seed)
-        value = np.array(image, dtype=np.float32)
-        total = value * count if total is None else total + value * count
+        total = total + np.array(image, dtype=np.float64) * count
         done += count
-    assert total is not None
-    mean = total / spp
-    if not features:
-        return TracedImage(np.ascontiguousarray(mean[..., :3], dtype=np.float32))
-    radiance, albedo, normal = (np.ascontiguousarray(mean[..., i : i + 3], dtype=np.float32) for i in (0, 3, 6))
-    return TracedImage(radiance, np.clip(albedo, 0, 1), normal)
+    return (total / spp).astype(np.float32)
 
 
 def flush() -> None:

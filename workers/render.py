@@ -45,25 +45,26 @@ def _render_frame(run: RunState, ref: UnitRef, camera: Camera, spp: int) -> None
     per_pass = -(-spp // passes)
     seed = run.seed(ref)
     total = np.zeros((camera.height, camera.width, 3), np.float64)
-    square, albedo, normal = total.copy(), total.copy(), total.copy()
+    square = total.copy()
+    albedo = normal = np.zeros_like(total, np.float32)
     non_finite = 0
     for index in range(passes):
-        image = trace(run.scene, camera, per_pass, (seed + index * 1_000_003) % 2**32, features=True)
+        image = trace(run.scene, camera, per_pass, (seed + index * 1_000_003) % 2**32, features=index == 0)
         finite = np.isfinite(image.radiance).all(axis=2, keepdims=True)
         non_finite += int(finite.size - finite.sum())
         radiance = np.where(finite, image.radiance, 0.0).astype(np.float64)
         total += radiance
         square += radiance**2
-        albedo += np.asarray(image.albedo, np.float64)
-        normal += np.asarray(image.normal, np.float64)
+        if image.albedo is not None and image.normal is not None:
+            albedo, normal = image.albedo, image.normal
     if non_finite > 1e-3 * camera.width * camera.height * passes:
         raise WorkerError(
             f"ground truth must be finite, got {non_finite} NaN or Inf pixels; look for NaN in the scene's textures"
         )
     mean = total / passes
     variance = np.maximum(square / passes - mean**2, 0.0) / max(passes - 1, 1)
-    layers = {"radiance": mean, "standard_error": np.sqrt(variance), "albedo": albedo / passes,
-              "normal": normal / passes}  # fmt: skip
+    layers = {"radiance": mean, "standard_error": np.sqrt(variance), "albedo": albedo,
+              "normal": normal}  # fmt: skip
     layers = {name: np.ascontiguousarray(value, np.float32) for name, value in layers.items()}
     layers["denoised"] = denoise(layers["radiance"], layers["albedo"], layers["normal"], quality="high")
     record = {"seconds": time.perf_counter() - start, "spp": per_pass * passes, "camera": camera_params(camera),
