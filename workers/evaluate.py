@@ -82,10 +82,12 @@ def run_evaluation(
                 advance(note=name)
     milliseconds = _interleaved_times(run, methods)
     positions = [_positions(renderer, camera) for camera in cameras]
-    rows = [
-        _row(name, frames[name], reference.frames, exposure, perceptual, cameras, positions, milliseconds[name])
-        for name in methods
-    ]
+    rows = []
+    with run.progress.track("score", len(methods)) as advance:
+        for name in methods:
+            shared = (reference.frames, exposure, perceptual, cameras, positions)
+            rows.append(_row(name, frames[name], *shared, milliseconds[name]))
+            advance(note=name)
     coverage = float(np.mean([renderer.render(camera).coverage for camera in cameras]))
     notes = [*run.scene.notes, *run.paths.notes]
     if reference.denoised:

@@ -1,0 +1,62 @@
+"""Inference: padding, encoding round trip, the identity of an untrained network, precision's gate."""
+
+import numpy as np
+import pytest
+import torch
+
+from models.network import FusionNet, NetworkConfig
+from models.transfer import Transfer
+from workers.query import CHANNELS, NUM_CHANNELS
+from workers.reconstruct import GBUFFER_CHANNELS, Encoding, Reconstructor, pad_to_multiple
+
+CONFIG = NetworkConfig(gbuffer_channels=GBUFFER_CHANNELS, widths=(16, 16, 16), unshuffle=2, residual=True)
+ENCODING = Encoding(exposure=0.5, distance_scale=4.0, transfer=Transfer())
+
+
+@pytest.fixture
+def features() -> np.ndarray:
+    rng = np.random.default_rng(5)
+    frame = rng.random((21, 35, NUM_CHANNELS)).astype(np.float32)
+    frame[..., slice(*CHANNELS["ir"])] *= 10.0
+    return frame
+
+
+@pytest.mark.parametrize("curve", ["mu-law", "log1p"])
+def test_encoding_round_trips_radiance(features: np.ndarray, curve: str) -> None:
+    encoding = Encoding(exposure=0.5, distance_scale=4.0, transfer=Transfer(curve=curve))
+    ir, gbuffer = encoding.inputs(torch.from_numpy(features)[None])
+    assert gbuffer.shape == (1, GBUFFER_CHANNELS, 21, 35)
+    radiance = encoding.radiance(ir)[0].permute(1, 2, 0).numpy()
+    np.testing.assert_allclose(radiance, features[..., :3], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(gbuffer[0, -1].numpy(), features[..., CHANNELS["distance"][0]] / 4.0, rtol=1e-6)
+    assert Encoding.from_json(encoding.to_json()) == encoding
+
+
+def test_untrained_network_returns_the_imperfect_radiance_at_any_size(features: np.ndarray) -> None:
+    frame = Reconstructor(FusionNet(CONFIG), ENCODING, precision="fp32")(features)
+    assert frame.shape == (21, 35, 3)
+    np.testing.assert_allclose(frame, features[..., :3], rtol=1e-4, atol=1e-5)
+
+
+def test_padding_repeats_the_edge_to_a_multiple() -> None:
+    tensor = torch.arange(6.0).reshape(1, 1, 2, 3)
+    padded = pad_to_multiple(tensor, 4)
+    assert padded.shape == (1, 1, 4, 4)
+    assert padded[0, 0, 3, 3] == 5.0
+    assert pad_to_multiple(padded, 4) is padded
+
+
+def test_bf16_is_refused_where_it_would_show(features: np.ndarray) -> None:
+    network = FusionNet(CONFIG)
+    with torch.no_grad():
+        for parameter in network.head.parameters():
+            parameter.normal_(0, 30.0)
+    reconstructor = Reconstructor(network, ENCODING, precision="bf16")
+    reconstructor(features)
+    assert reconstructor.choices == {"35x21": "fp32"}
+
+
+def test_non_finite_input_is_not_hidden(features: np.ndarray) -> None:
+    features[4, 4, 0] = np.nan
+    frame = Reconstructor(FusionNet(CONFIG), ENCODING, precision="fp32")(features)
+    assert not np.isfinite(frame).all()
