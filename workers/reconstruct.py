@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from models.metrics import psnr, tone_map
 from models.network import FusionNet, NetworkConfig
@@ -65,6 +65,22 @@ def pad_to_multiple(tensor: Tensor, multiple: int) -> Tensor:
     return F.pad(tensor, (0, right, 0, bottom), mode="replicate") if bottom or right else tensor
 
 
+class FrameModule(nn.Module):
+    """From queried features to radiance in one module, so that a compiler fuses the transfer functions too."""
+
+    def __init__(self, network: FusionNet, encoding: Encoding) -> None:
+        super().__init__()
+        self.network, self.encoding = network, encoding
+
+    def forward(self, features: Tensor) -> Tensor:
+        """[height, width, NUM_CHANNELS] to linear radiance [height, width, 3], both float32."""
+        height, width = features.shape[:2]
+        multiple = self.network.config.size_multiple
+        inputs = [pad_to_multiple(x, multiple) for x in self.encoding.inputs(features[None])]
+        output = self.network(*inputs)[..., :height, :width]
+        return self.encoding.radiance(output)[0].permute(1, 2, 0).contiguous()
+
+
 class Reconstructor:
     """A trained network ready to turn features into frames.
 
@@ -81,7 +97,7 @@ class Reconstructor:
         self.encoding = encoding
         self.device = next(network.parameters()).device
         self.config: NetworkConfig = network.config
-        self._fp32 = channels_last(network.eval())
+        self._fp32 = FrameModule(channels_last(network.eval()), encoding)
         self._precision, self._compile = precision, compile
         self._chosen: dict[tuple[int, int], Any] = {}
         self.choices: dict[str, str] = {}
@@ -90,44 +106,41 @@ class Reconstructor:
         """float32 [height, width, NUM_CHANNELS] to linear radiance, float32 [height, width, 3]."""
         height, width = features.shape[:2]
         with torch.inference_mode():
-            tensor = torch.from_numpy(features)[None].to(self.device, non_blocking=True)
-            inputs = [pad_to_multiple(x, self.config.size_multiple) for x in self.encoding.inputs(tensor)]
+            tensor = torch.from_numpy(features).to(self.device, non_blocking=True)
             if (height, width) not in self._chosen:
-                self._chosen[height, width] = self._choose(inputs, (height, width))
-            network = self._chosen[height, width]
-            output = network(*inputs)[..., :height, :width]
-            radiance = self.encoding.radiance(output)[0].permute(1, 2, 0)
-            return np.ascontiguousarray(radiance.cpu().numpy())
+                self._chosen[height, width] = self._choose(tensor, (height, width))
+            return self._chosen[height, width](tensor).cpu().numpy()
 
-    def _choose(self, inputs: list[Tensor], size: tuple[int, int]) -> Any:
+    def _choose(self, features: Tensor, size: tuple[int, int]) -> Any:
         """Measures the candidates on real input of this size, once."""
         candidates: dict[str, Any] = {"fp32": self._fp32}
-        if self._precision != "fp32" and self._passes_gate(inputs):
-            candidates["bf16"] = self._bf16()
+        if self._precision != "fp32":
+            bf16 = self._bf16()
+            if self._passes_gate(bf16, features):
+                candidates["bf16"] = bf16
         if self._precision == "bf16" and "bf16" in candidates:
             del candidates["fp32"]
-        times = {name: _seconds(network, inputs) for name, network in candidates.items()}
+        times = {name: _seconds(module, features) for name, module in candidates.items()}
         best = min(times, key=lambda name: times[name])
-        network = candidates[best]
+        module = candidates[best]
         if self._compile:
-            compiled = _try_compile(network, inputs)
-            if compiled is not None and _seconds(compiled, inputs) < times[best]:
-                network, best = compiled, f"{best} compiled"
+            compiled = _try_compile(module, features)
+            if compiled is not None and _seconds(compiled, features) < times[best]:
+                module, best = compiled, f"{best} compiled"
         self.choices[f"{size[1]}x{size[0]}"] = best
-        return network
+        return module
 
-    def _bf16(self) -> FusionNet:
+    def _bf16(self) -> FrameModule:
         network = FusionNet(self.config).to(self.device)
-        network.load_state_dict(self._fp32.state_dict())
-        return channels_last(network.eval().to(torch.bfloat16))
+        network.load_state_dict(self._fp32.network.state_dict())
+        return FrameModule(channels_last(network.eval().to(torch.bfloat16)), self.encoding)
 
-    def _passes_gate(self, inputs: list[Tensor]) -> bool:
-        exposure = self.encoding.exposure
-        frames = [self.encoding.radiance(net(*inputs))[0].permute(1, 2, 0).cpu().numpy()
-                  for net in (self._fp32, self._bf16())]  # fmt: skip
+    def _passes_gate(self, bf16: FrameModule, features: Tensor) -> bool:
+        frames = [module(features).cpu().numpy() for module in (self._fp32, bf16)]
         if not all(np.isfinite(frame).all() for frame in frames):
             return False
-        return psnr(tone_map(frames[1], exposure), tone_map(frames[0], exposure)) >= BF16_GATE_DB
+        shown = [tone_map(frame, self.encoding.exposure) for frame in frames]
+        return psnr(shown[1], shown[0]) >= BF16_GATE_DB
 
 
 def channels_last(network: FusionNet) -> FusionNet:
@@ -138,24 +151,24 @@ def channels_last(network: FusionNet) -> FusionNet:
     return network
 
 
-def _seconds(network: Any, inputs: list[Tensor]) -> float:
+def _seconds(module: Any, features: Tensor) -> float:
     """Best of a few runs after a warm-up."""
-    network(*inputs)
+    module(features)
     times = []
     for _ in range(PROBE_REPEATS):
         start = time.perf_counter()
-        network(*inputs)
-        if inputs[0].is_cuda:
+        module(features)
+        if features.is_cuda:
             torch.cuda.synchronize()
         times.append(time.perf_counter() - start)
     return min(times)
 
 
-def _try_compile(network: Any, inputs: list[Tensor]) -> Any:
-    """The compiled network, or None where this machine cannot compile (no C++ compiler, say)."""
+def _try_compile(module: Any, features: Tensor) -> Any:
+    """The compiled module, or None where this machine cannot compile (no C++ compiler, say)."""
     try:
-        compiled = torch.compile(network, dynamic=False)
-        compiled(*inputs)
+        compiled = torch.compile(module, dynamic=False)
+        compiled(features)
     except Exception:  # torch raises many kinds; eager is always there
         return None
     return compiled
