@@ -23,7 +23,7 @@ CONSTRAINTS := -c constraints.txt $(if $(filter cpu,$(TORCH)),-c constraints-cpu
 .DELETE_ON_ERROR:
 
 demo: .venv/.ready
-	$(BIN)/lightwell demo
+	$(BIN)/lightwell demo $(DEMO_OPTIONS)
 
 test: check
 	$(BIN)/python -m pytest -q
