@@ -11,9 +11,14 @@ from scipy.spatial import cKDTree
 
 from workers.elements import ElementSet
 
-NUM_NEIGHBOURS = 12
+# Part of the keys of what is made from filtered caches; raise it whenever the filter's result changes.
+FILTER_VERSION = 2
+NUM_NEIGHBOURS = 24
+PASSES = 2
 NORMAL_POWER = 16
-RANGE_STRENGTH = 1.0
+RANGE_STRENGTH = 4.0
+SIGMA_SPACINGS = 1.6
+SIGMA_SPACINGS_DIRECTIONAL = 1.0
 # A neighbour further than this many median spacings is no neighbour.
 MAX_SPACINGS = 3.0
 
@@ -29,23 +34,36 @@ def filter_diffuse(elements: ElementSet, mean: np.ndarray, standard_error: np.nd
     Returns:
         float32 [n, 3].
     """
-    index, weight = _neighbours(elements, np.arange(elements.num_elements))
+    index, weight = _neighbours(elements, np.arange(elements.num_elements), SIGMA_SPACINGS)
     variance = np.mean(standard_error.astype(np.float64) ** 2, axis=1)
-    # An element's own estimate of variance is noisy (a firefly raises both): pool it over the neighbourhood.
+    values = mean.astype(np.float64)
+    for _ in range(PASSES):
+        values, variance = _filter_once(values, variance, index, weight)
+    return values.astype(np.float32)
+
+
+def _filter_once(
+    values: np.ndarray, variance: np.ndarray, index: np.ndarray, weight: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """One pass: filtered values [n, 3] and the variance [n] that is left in them.
+
+    An element's own estimate of variance is noisy (a firefly raises both), so it is pooled over the neighbourhood.
+    Weights by inverse variance would be biased for the same reason: where few paths find the light, the elements
+    that missed it look the surest.
+    """
     pooled = np.sum(weight * variance[index], axis=1) / np.sum(weight, axis=1)
-    difference = np.mean((mean[index].astype(np.float64) - mean[:, None]) ** 2, axis=2)
+    difference = np.mean((values[index] - values[:, None]) ** 2, axis=2)
     noise = pooled[index] + pooled[:, None]
-    range_weight = np.exp(-np.maximum(difference - noise, 0.0) / (RANGE_STRENGTH * noise + 1e-12))
-    total = weight * range_weight
-    result = np.einsum("nk,nkc->nc", total, mean[index].astype(np.float64)) / total.sum(axis=1, keepdims=True)
-    return result.astype(np.float32)
+    total = weight * np.exp(-np.maximum(difference - noise, 0.0) / (RANGE_STRENGTH * noise + 1e-12))
+    total /= total.sum(axis=1, keepdims=True)
+    return np.einsum("nk,nkc->nc", total, values[index]), np.sum(total**2 * variance[index], axis=1)
 
 
 def filter_directional(elements: ElementSet, values: np.ndarray) -> np.ndarray:
     """Denoised directional lobe: place and normal alone; float32 [g, polar, azimuth, 3], as given."""
     if len(values) == 0:
         return values
-    index, weight = _neighbours(elements, elements.glossy)
+    index, weight = _neighbours(elements, elements.glossy, SIGMA_SPACINGS_DIRECTIONAL)
     weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
     result = np.zeros_like(values)
     for k in range(index.shape[1]):
@@ -53,7 +71,7 @@ def filter_directional(elements: ElementSet, values: np.ndarray) -> np.ndarray:
     return result
 
 
-def _neighbours(elements: ElementSet, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _neighbours(elements: ElementSet, members: np.ndarray, sigma_spacings: float) -> tuple[np.ndarray, np.ndarray]:
     """Nearest members of each member (itself first) and their weights; int64, float64 [n, k]."""
     position, normal = elements.position[members].astype(np.float64), elements.normal[members].astype(np.float64)
     shape, side = elements.shape[members], elements.side[members]
@@ -61,7 +79,7 @@ def _neighbours(elements: ElementSet, members: np.ndarray) -> tuple[np.ndarray, 
     distance, index = cKDTree(position).query(position, k=k, workers=2)
     distance, index = distance.reshape(len(members), k), index.reshape(len(members), k)
     spacing = np.maximum(np.median(distance[:, 1:5], axis=1) if k > 4 else distance[:, -1], 1e-30)
-    weight = np.exp(-0.5 * (distance / spacing[:, None]) ** 2)
+    weight = np.exp(-0.5 * (distance / (sigma_spacings * spacing[:, None])) ** 2)
     weight *= np.maximum(np.einsum("nkc,nc->nk", normal[index], normal), 0.0) ** NORMAL_POWER
     weight *= (shape[index] == shape[:, None]) & (side[index] == side[:, None])
     weight *= distance <= MAX_SPACINGS * spacing[:, None]

@@ -8,6 +8,7 @@ import numpy as np
 from storage.frames import decode_frame, encode_frame, health
 from storage.store import UnitRef
 from workers.bake import bake_refs
+from workers.cache_filter import FILTER_VERSION
 from workers.camera import Camera
 from workers.elements import ElementSet
 from workers.query import CHANNELS, QueryProgram
@@ -21,7 +22,7 @@ def inputs_ref(run: RunState, elements: ElementSet, camera: Camera) -> UnitRef:
     """The unit that holds a pose's network inputs."""
     caches = {name: ref.key for name, ref in bake_refs(run, elements).items()}
     params = {"camera": camera_params(camera), "caches": caches, "query": dataclasses.asdict(run.settings.query),
-              "demodulate": run.settings.cache.demodulate, "denoise": run.settings.cache.denoise}  # fmt: skip
+              "demodulate": run.settings.cache.demodulate, "denoise": FILTER_VERSION if run.settings.cache.denoise else 0}  # fmt: skip
     return run.ref(STAGE, params)
 
 

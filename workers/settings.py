@@ -43,7 +43,7 @@ class CacheSettings:
     max_elements: int = 60_000
     min_spacing_px: float = 1.5
     domain_poses: int = 40
-    diffuse_spp: int = 512
+    diffuse_spp: int = 2048
     azimuth: int = 32
     polar: int = 8
     directional_spp: int = 8
@@ -207,18 +207,18 @@ class Settings:
 _PRESETS: dict[str, dict[str, Any]] = {
     "draft": {},
     "balanced": {
-        "cache.max_elements": 150_000, "cache.diffuse_spp": 1024, "cache.directional_spp": 16,
+        "cache.max_elements": 150_000, "cache.diffuse_spp": 4096, "cache.directional_spp": 16,
         "frames.num_train": 72, "frames.num_validation": 8, "frames.num_test": 12, "frames.train_spp": 256,
         "frames.test_spp": 4096, "train.seconds": 3600.0, "train.epochs": 1000,
     },
     "reference": {
-        "cache.max_elements": 400_000, "cache.diffuse_spp": 4096, "cache.azimuth": 64, "cache.polar": 16,
+        "cache.max_elements": 400_000, "cache.diffuse_spp": 16_384, "cache.azimuth": 64, "cache.polar": 16,
         "cache.directional_spp": 32, "frames.num_train": 90, "frames.num_validation": 10, "frames.num_test": 200,
         "frames.train_spp": 4000, "frames.denoise_train": False, "frames.test_spp": 4000,
         "train.seconds": 0.0, "train.epochs": 1000, "train.widths": (48, 64, 96),
     },
     "demo": {
-        "width": 256, "height": 256, "cache.max_elements": 40_000, "cache.diffuse_spp": 256,
+        "width": 256, "height": 256, "cache.max_elements": 40_000, "cache.diffuse_spp": 512,
         "frames.num_train": 24, "frames.num_validation": 3, "frames.num_test": 4, "frames.train_spp": 64,
         "frames.test_spp": 512, "train.seconds": 200.0,
     },
