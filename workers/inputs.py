@@ -21,8 +21,14 @@ FILE = "inputs.exr"
 def inputs_ref(run: RunState, elements: ElementSet, camera: Camera) -> UnitRef:
     """The unit that holds a pose's network inputs."""
     caches = {name: ref.key for name, ref in bake_refs(run, elements).items()}
-    params = {"camera": camera_params(camera), "caches": caches, "query": dataclasses.asdict(run.settings.query),
-              "demodulate": run.settings.cache.demodulate, "denoise": FILTER_VERSION if run.settings.cache.denoise else 0}  # fmt: skip
+    cache = run.settings.cache
+    params = {
+        "camera": camera_params(camera),
+        "caches": caches,
+        "query": dataclasses.asdict(run.settings.query),
+        "demodulate": cache.demodulate,
+        "denoise": FILTER_VERSION if cache.denoise else 0,
+    }
     return run.ref(STAGE, params)
 
 
