@@ -8,7 +8,7 @@ import numpy as np
 
 from storage.store import UnitRef
 from workers.camera_path import domain_poses
-from workers.elements import ElementSet, build_elements
+from workers.elements import ELEMENTS_VERSION, ElementSet, build_elements
 from workers.lattice import PatchTable
 from workers.run_state import PATH_SEED, RunState, camera_params
 from workers.visibility import domain_hits
@@ -24,7 +24,7 @@ def elements_ref(run: RunState) -> UnitRef:
     cache = dataclasses.asdict(run.settings.cache)
     path = [camera_params(camera) for camera in run.paths.train + run.paths.validation]
     domain = {"radius": run.paths.domain_radius, "angle_deg": run.paths.domain_angle_deg}
-    params = {name: cache[name] for name in _KEYED} | {"path": path, "domain": domain}
+    params = {name: cache[name] for name in _KEYED} | {"path": path, "domain": domain, "version": ELEMENTS_VERSION}
     return run.ref(STAGE, params)
 
 

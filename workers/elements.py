@@ -29,6 +29,9 @@ from workers.visibility import Hits
 
 NOT_BAKED = np.uint32(1 << 31)  # flag on a slot: answered by its nearest baked neighbour
 NO_SLOT = np.uint32(0xFFFFFFFF)
+# Part of the keys of what is made from element sets; raise it whenever the same settings give other elements.
+ELEMENTS_VERSION = 2
+INSET = 0.15  # of the spacing
 MERGE_VOXEL = 0.45  # of the spacing
 SPACING_STEPS = 10
 NORMAL_BINS = 4
@@ -279,14 +282,19 @@ def _assemble(
     glossy_rank = np.full(len(chosen), -1, np.int64)
     glossy_rank[glossy] = np.arange(len(glossy))
     slots = _Slots(table, lattice, points, element, chosen)
+    uv, position, normal = points.uv[chosen], points.position[chosen], points.normal[chosen]
+    if settings.elements == "lattice":
+        uv = _inset(table, lattice, points, chosen)
+        place = (points.shape[chosen], points.prim_local[chosen], uv, points.side[chosen])
+        position, normal, _ = surface_frame(table, *place)
     return ElementSet(
         patches=lattice.patches,
         shape=points.shape[chosen],
         prim_local=points.prim_local[chosen],
-        uv=points.uv[chosen],
+        uv=uv,
         side=points.side[chosen],
-        position=points.position[chosen],
-        normal=points.normal[chosen],
+        position=position,
+        normal=normal,
         glossy=glossy,
         diffuse_slot=slots.fill(
             np.where(diffuse_shape[points.shape[chosen]], np.arange(len(chosen)), -1), diffuse_shape
@@ -294,6 +302,21 @@ def _assemble(
         glossy_slot=slots.fill(glossy_rank, glossy_shape),
         spacing_px=spacing,
     )
+
+
+def _inset(table: SurfaceTable, lattice: _Lattice, points: _Points, chosen: np.ndarray) -> np.ndarray:
+    """Where elements are baked: `INSET` of the lattice's spacing from their point towards the primitive's centre.
+
+    A point on the edge between two walls lies in both: rays that leave it slip behind the other wall, and the corner
+    would be cached black or leak light.
+    """
+    point = lattice.touched[chosen] // 2
+    prim = table.prim_offset[points.shape[chosen]] + points.prim_local[chosen]
+    patch = np.searchsorted(lattice.patches.patch_base, point, side="right") - 1
+    divisions = lattice.patches.prim_patches[prim] * np.maximum(lattice.patches.patch_level[patch], 1)
+    centre = np.where(lattice.patches.prim_is_square[prim], 1 / 2, 1 / 3)[:, None]
+    uv = points.uv[chosen]
+    return (uv + (centre - uv) * (INSET / divisions)[:, None]).astype(np.float32)
 
 
 def _bake_order(shape: np.ndarray, position: np.ndarray) -> np.ndarray:
