@@ -8,18 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from models.metrics import score_frame
+from models.metrics import exposure_from_luminance, luminance, score_frame
 from storage.caches import CacheSet
 from storage.store import Store, UnitRef
 from workers.bake import bake_refs, cache_nbytes, load_caches, run_bake
 from workers.element_stage import run_elements
 from workers.elements import ElementSet
-from workers.evaluate import load_reference
+from workers.evaluate import load_reference, mean_score
 from workers.inputs import run_inputs
 from workers.progress import Progress
 from workers.query import CHANNELS, QueryProgram
 from workers.reconstruct import Reconstructor
-from workers.render import run_render
+from workers.render import load_render, run_render
 from workers.run_state import RunState
 from workers.scene import Scene
 from workers.settings import Settings
@@ -99,22 +99,14 @@ def _row(run: RunState, variant: Variant) -> dict[str, Any]:
     reference = load_reference(run, test_refs, exposure)
     ir_scores, scores = ([score_frame(x, y, exposure) for x, y in zip(images, reference.frames, strict=True)]
                          for images in (irs, finals))  # fmt: skip
-    row = {"name": variant.name, "network": variant.network, "ir_psnr": _mean(ir_scores, "psnr")}
-    row |= {metric: _mean(scores, metric) for metric in ("psnr", "ssim", "flip")}
+    row = {"name": variant.name, "network": variant.network, "ir_psnr": mean_score(ir_scores, "psnr")}
+    row |= {metric: mean_score(scores, metric) for metric in ("psnr", "ssim", "flip")}
     return row | _bake_cost(run, elements)
 
 
 def _exposure(run: RunState, refs: list[UnitRef]) -> float:
-    from models.metrics import exposure_from_luminance, luminance
-    from workers.render import load_render
-
     layer = "denoised" if run.settings.frames.denoise_train else "radiance"
     return exposure_from_luminance([luminance(load_render(run, ref)[layer]) for ref in refs])
-
-
-def _mean(scores: list[Any], metric: str) -> float | None:
-    values = [getattr(score, metric) for score in scores]
-    return None if any(value is None for value in values) else float(np.mean(values))
 
 
 def _bake_cost(run: RunState, elements: ElementSet) -> dict[str, float]:

@@ -16,7 +16,6 @@ from workers.lobes import LobeClass, context, diffuse_reflectance, has, specular
 from workers.surfaces import SurfaceTable
 from workers.transport import CachedLobes, exitant_start, incident_radiance, lambertian_start
 
-GOLDEN = 0x9E3779B97F4A7C15
 GRAZING_COSINE = 0.02  # directions below are baked at this cosine: a surface seen edge-on shows nothing
 
 

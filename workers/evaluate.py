@@ -194,12 +194,13 @@ def _row(
     non_finite = sum(score.non_finite for score in scores)
     row: dict[str, Any] = {"name": name}
     for metric in ("psnr", "ssim", "flip", "st_lpips", "relmse"):
-        row[metric] = _mean(scores, metric)
+        row[metric] = mean_score(scores, metric)
     row["temporal"] = None if non_finite else _temporal(frames, references, exposure, cameras, positions)
     return row | {"ms": milliseconds, "non_finite": non_finite}
 
 
-def _mean(scores: list[Scores], metric: str) -> float | None:
+def mean_score(scores: list[Scores], metric: str) -> float | None:
+    """Mean of a metric over frames, or None where any frame was refused it."""
     values = [getattr(score, metric) for score in scores]
     return None if any(value is None for value in values) else float(np.mean(values))
 

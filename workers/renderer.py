@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from storage.errors import StorageError
 from storage.store import Store, UnitRef
 from workers.bake import load_caches
 from workers.camera import Camera
@@ -19,8 +18,6 @@ from workers.run_state import RunState
 from workers.scene import load_scene
 from workers.settings import Settings
 from workers.train import load_network
-
-SERVE_STAGE = "serve"
 
 
 @dataclass(frozen=True)
@@ -130,7 +127,4 @@ def open_run(store: Store, entry: dict[str, Any], progress: Progress) -> tuple[R
 def renderable_scenes(store: Store) -> list[dict[str, Any]]:
     """Scenes of a store that can be served."""
     names = ("name", "digest", "width", "height", "preset", "psnr")
-    try:
-        return [{name: entry.get(name) for name in names} for entry in store.scenes() if "network" in entry]
-    except StorageError:
-        raise
+    return [{name: entry.get(name) for name in names} for entry in store.scenes() if "network" in entry]
