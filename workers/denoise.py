@@ -3,6 +3,7 @@
 import mitsuba_oidn
 import numpy as np
 
+from workers.backend import pool_at_rest
 from workers.errors import WorkerError
 
 QUALITIES = ("fast", "balanced", "high")
@@ -37,7 +38,7 @@ def denoise(
     if not np.isfinite(radiance).all():
         raise WorkerError("denoiser input must be finite, got NaN or Inf; render the image again")
     images = [None if x is None else np.ascontiguousarray(x, np.float32) for x in (radiance, albedo, normal)]
-    result = mitsuba_oidn.denoise(
-        *images, hdr=True, clean_aux=clean_features, quality=getattr(mitsuba_oidn.Quality, quality.capitalize())
-    )
+    strength = getattr(mitsuba_oidn.Quality, quality.capitalize())
+    with pool_at_rest():
+        result = mitsuba_oidn.denoise(*images, hdr=True, clean_aux=clean_features, quality=strength)
     return np.asarray(result)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from storage.store import Store, UnitRef
+from workers.backend import pool_at_rest
 from workers.bake import load_caches
 from workers.camera import Camera
 from workers.element_stage import run_elements
@@ -79,7 +80,8 @@ class FrameRenderer:
         start = time.perf_counter()
         features = self.program.run(camera)
         queried = time.perf_counter()
-        radiance = self.reconstructor(features)
+        with pool_at_rest():
+            radiance = self.reconstructor(features)
         finished = time.perf_counter()
         a, b = CHANNELS["coverage"]
         return Frame(
