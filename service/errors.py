@@ -55,3 +55,11 @@ class JobDatabaseError(ServiceError, OSError):
 
 class LeaseLostError(ServiceError, RuntimeError):
     """Another process runs the job now; what this one has to say about it no longer counts."""
+
+
+class UnreachableError(ServiceError, OSError):
+    """No service answers at an address."""
+
+
+class RequestRefusedError(ServiceError, ValueError):
+    """A service answered a request of ours with an error."""

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 OnEvent = Callable[[dict[str, Any]], None]
 ShouldStop = Callable[[], Stop | None]
+_FOUND_WITHIN_S = 0.05
+"""A stage that advances at once says what it found in the store, which tells nothing about the time left."""
 
 
 class EventProgress(Progress):
@@ -45,19 +47,23 @@ class EventProgress(Progress):
     def track(self, description: str, total: float) -> Iterator[Callable[..., None]]:
         """Tells of every step; the time left is that of the steps of this run, those found in the store apart."""
         self.check()
-        start_s, first, done = time.monotonic(), None, 0.0
+        start_s, found, done = time.monotonic(), None, 0.0
 
         def advance(amount: float = 1.0, note: str = "") -> None:
-            nonlocal first, done
+            nonlocal found, done
             done += amount
-            if first is None and amount != 1.0:  # the stage found so many in the store
-                first = done
-            self._tell(description, done, total, self._eta_s(start_s, done - (first or 0.0), total - done), note)
+            elapsed_s = time.monotonic() - start_s
+            if found is None:
+                found = done if elapsed_s < _FOUND_WITHIN_S else 0.0
+            computed = done - found
+            eta_s = elapsed_s / computed * max(total - done, 0.0) if computed > 0 else None
+            self._tell(description, done, total, eta_s, note)
             self.check()
 
         self._tell(description, 0.0, total, None, "")
         yield advance
-        self._tell(description, total, total, 0.0, "")
+        if done < total:
+            self._tell(description, total, total, 0.0, "")
 
     def message(self, text: str) -> None:
         """One line that is no progress."""
@@ -65,13 +71,7 @@ class EventProgress(Progress):
 
     def _tell(self, stage: str, done: float, total: float, eta_s: float | None, note: str) -> None:
         done, total = float(min(done, total)), float(total)
-        self._on_event(
-            {"kind": "progress", "stage": stage, "done": done, "total": total, "eta_s": eta_s, "note": note}
-        )
-
-    @staticmethod
-    def _eta_s(start_s: float, done: float, left: float) -> float | None:
-        return None if done <= 0 else (time.monotonic() - start_s) / done * max(left, 0.0)
+        self._on_event({"kind": "progress", "stage": stage, "done": done, "total": total, "eta_s": eta_s, "note": note})
 
 
 class _ToldStore(Store):
@@ -95,13 +95,14 @@ def frame_preview(exr: bytes) -> bytes:
     """A rendered frame as PNG, exposed by itself: the scene's own exposure is known after training only."""
     import numpy as np
 
-    from models.metrics import luminance
+    from models.metrics import exposure_from_luminance, luminance
     from service.images import PNG, encode
     from storage.frames import decode_frame
 
     radiance = decode_frame(exr)["radiance"]
-    bright = float(np.percentile(luminance(radiance), 80))
-    return encode(radiance, 0.6 / bright if bright > 0 else 1.0, PNG)
+    light = luminance(radiance)
+    finite = light[np.isfinite(light)]
+    return encode(radiance, exposure_from_luminance([finite]) if finite.size else 1.0, PNG)
 
 
 class LocalRunner:
@@ -136,6 +137,7 @@ class LocalRunner:
 
         settings = Settings.from_json(spec.settings)
         store = _ToldStore.open(self._store_url, create=True)
+        assert isinstance(store, _ToldStore)  # `open` makes the class that it is called on
         store.on_event = on_event
         progress.check()
         scene = load_scene(spec.scene, width=settings.width, height=settings.height)
@@ -152,20 +154,20 @@ class LocalRunner:
         return {"evaluation": result, "units": store.num_commits, "set_aside": []}
 
 
-def run_stages(
-    stages: tuple[str, ...], scene: "Scene", store: Store, settings: "Settings", progress: Progress
-) -> None:
+def run_stages(stages: tuple[str, ...], scene: "Scene", store: Store, settings: "Settings", progress: Progress) -> None:
     """The stages of `run_scene` without the last ones: what was made is found by the job that goes further."""
-    from workers.bake import run_bake
+    from workers.bake import load_caches, run_bake
     from workers.element_stage import run_elements
     from workers.inputs import run_inputs
-    from workers.pipeline import RENDER_STAGES, _known, _program
+    from workers.pipeline import RENDER_STAGES
+    from workers.query import QueryProgram
     from workers.render import run_render
     from workers.run_state import RunState
     from workers.train import run_train
 
     run = RunState(scene, store, settings, progress)
-    store.register_scene(scene.digest, _known(store, scene) | {"name": scene.name, "source": str(scene.source)})
+    if scene.digest not in {entry["digest"] for entry in store.scenes()}:
+        store.register_scene(scene.digest, {"name": scene.name, "source": str(scene.source)})
     elements = run_elements(run)
     run_bake(run, elements)
     if "render" not in stages:
@@ -176,7 +178,7 @@ def run_stages(
     run_render(run, paths.test, frames.test_spp, RENDER_STAGES["test"])
     if "train" not in stages:
         return
-    program = _program(run, elements)
+    program = QueryProgram(scene.mi_scene, run.table, elements, load_caches(run, elements), settings.query)
     inputs = [run_inputs(run, elements, program, cameras) for cameras in (paths.train, paths.validation)]
     run_train(run, (inputs[0], train), (inputs[1], validation))
 

@@ -1,12 +1,12 @@
 """Jobs over HTTP: submit, look, steer, watch, fetch.
 
-    POST   /v1/jobs                     202 and Location; Idempotency-Key makes a repeat harmless
-    GET    /v1/jobs                     pages, the latest first, by state
-    GET    /v1/jobs/{id}                one job
-    DELETE /v1/jobs/{id}                cancel; also POST .../pause, .../resume, .../retry
-    GET    /v1/jobs/{id}/events         server-sent events, resumed by Last-Event-ID
-    GET    /v1/jobs/{id}/preview.png    the latest pass;  .../result  as JSON;  .../report  as a page
-    POST   /v1/plan                     what a job would do and cost
+POST   /v1/jobs                     202 and Location; Idempotency-Key makes a repeat harmless
+GET    /v1/jobs                     pages, the latest first, by state
+GET    /v1/jobs/{id}                one job
+DELETE /v1/jobs/{id}                cancel; also POST .../pause, .../resume, .../retry
+GET    /v1/jobs/{id}/events         server-sent events, resumed by Last-Event-ID
+GET    /v1/jobs/{id}/preview.png    the latest pass;  .../result  as JSON;  .../report  as a page
+POST   /v1/plan                     what a job would do and cost
 """
 
 import asyncio
@@ -23,7 +23,7 @@ from service.jobs.report import job_report
 from service.jobs.run import PREVIEW, REPORT
 from service.jobs.schemas import EXAMPLE_JOB, JobPage, JobRequest, JobResult, JobView, PlanRequest, PlanView
 from service.jobs.service import Jobs
-from service.jobs.states import Event, State
+from service.jobs.states import TERMINAL, Event, State
 from service.jobs.stream import event_number, stream_events
 from service.problems import problem_responses
 
@@ -78,9 +78,7 @@ def _add_views(router: APIRouter, jobs: Jobs) -> None:
     ) -> JobPage:
         found = jobs.table.page(states=state or (), limit=limit + 1, before=before)
         page = found[:limit]
-        return JobPage(
-            jobs=[JobView.of(job) for job in page], next=page[-1].number if len(found) > limit else None
-        )
+        return JobPage(jobs=[JobView.of(job) for job in page], next=page[-1].number if len(found) > limit else None)
 
     @router.get("/jobs/{job_id}", summary="One job", responses=problem_responses(404, 422))
     def show_job(job_id: JobId) -> JobView:
@@ -89,8 +87,8 @@ def _add_views(router: APIRouter, jobs: Jobs) -> None:
     @router.get(
         "/jobs/{job_id}/events",
         summary="What happens to a job, as it happens",
-        description="Server-sent events `state`, `progress`, `message`, `preview`, `report`, `set_aside` and `retry`, each "
-        "with JSON data and a number; the stream ends when the job has. Last-Event-ID resumes it.",
+        description="Server-sent events `state`, `progress`, `message`, `preview`, `report`, `set_aside` and `retry`, "
+        "each with JSON data and a number; the stream ends when the job has. Last-Event-ID resumes it.",
         response_class=Response,
         responses=problem_responses(404, 422) | {
             200: {"description": "the stream", "content": {"text/event-stream": {"schema": {"type": "string"}}}},
@@ -100,7 +98,7 @@ def _add_views(router: APIRouter, jobs: Jobs) -> None:
     def events(job_id: JobId, last_event_id: Annotated[str | None, Header()] = None) -> Response:
         job = jobs.table.get(job_id)
         after = event_number(last_event_id)
-        if State(job.state) in (State.CANCELLED, State.FAILED, State.COMPLETE) and after >= job.last_seq:
+        if State(job.state) in TERMINAL and after >= job.last_seq:
             return Response(status_code=204)
         stream = stream_events(jobs.database, job, after, heartbeat_s=jobs.heartbeat_s)
         return EventSourceResponse(stream, headers=STREAM_HEADERS)
@@ -134,7 +132,9 @@ def _add_files(router: APIRouter, jobs: Jobs) -> None:
         job = jobs.table.get(job_id)
         content = jobs.table.file(job, PREVIEW)
         if content is None:
-            raise NotReadyError(f"job {job_id} must have rendered something for a preview, it is {job.state}; ask later")
+            raise NotReadyError(
+                f"job {job_id} must have rendered something for a preview, it is {job.state}; ask later"
+            )
         return Response(content, media_type="image/png", headers={"Cache-Control": "no-store"})
 
     @router.get("/jobs/{job_id}/result", summary="What a job computed", responses=problem_responses(404, 409, 422))

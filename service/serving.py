@@ -39,12 +39,12 @@ def serve_store(store_url: str, host: str, port: int, *, database_url: str | Non
     """Serves until it is interrupted.
 
     Args:
-        store_url: a folder or fsspec URL that holds a store.
+        store_url: a folder or fsspec URL; a new store is made where there is none, for jobs to fill.
         host, port: where to listen.
         database_url: where jobs are kept; None: an SQLite file in the store's folder.
 
     Raises:
-        StorageError: there is no store at the URL.
+        StorageError: the store cannot be opened or made.
         OptionError: the address cannot be had.
         JobDatabaseError: the job database cannot be used.
     """
@@ -57,7 +57,7 @@ def serve_store(store_url: str, host: str, port: int, *, database_url: str | Non
     from service.scene_names import resolve_builtin_scene
     from storage.store import Store
 
-    Store.open(store_url)
+    Store.open(store_url, create=True)
     with bind(host, port) as listener:
         url = f"http://{f'[{host}]' if ':' in host else host}:{listener.getsockname()[1]}"
         if not is_loopback(host):

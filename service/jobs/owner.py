@@ -40,4 +40,3 @@ def is_gone(owner: str) -> bool:
     except psutil.Error:
         return False
     return abs(created_s - float(parts[2])) > _RECYCLED_S or status == psutil.STATUS_ZOMBIE
-

@@ -55,7 +55,7 @@ class JobRequest(PlanRequest):
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [EXAMPLE_REQUEST | {"priority": 5}]})
 
     stages: list[Stage] = Field(
-        default=list(STAGES), min_length=1, max_length=len(STAGES),
+        default=["bake", "render", "train", "evaluate"], min_length=1, max_length=len(STAGES),
         description="how far to go: the first of bake, render, train, evaluate, in that order",
     )  # fmt: skip
     priority: int = Field(

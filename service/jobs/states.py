@@ -1,9 +1,9 @@
 """The life of a job as data: one table of (state, event) -> state, and nothing else changes a state.
 
-    queued -> running -> complete | failed
-      |         |-> pausing -> paused -> queued (resume)
-      |         '-> cancelling -> cancelled
-      '-> paused, cancelled          a retry queues what ended: the store still has what was computed
+queued -> running -> complete | failed
+  |         |-> pausing -> paused -> queued (resume)
+  |         '-> cancelling -> cancelled
+  '-> paused, cancelled          a retry queues what ended: the store still has what was computed
 """
 
 from enum import StrEnum

@@ -136,9 +136,7 @@ class JobTable:
     def file(self, job: Job, name: str) -> bytes | None:
         """One of a job's files; None where there is none."""
         with self.database.reading() as session:
-            return session.scalar(
-                select(JobFile.content).where(JobFile.job_number == job.number, JobFile.name == name)
-            )
+            return session.scalar(select(JobFile.content).where(JobFile.job_number == job.number, JobFile.name == name))
 
     def _insert(self, session: Session, submission: Submission, key: str | None) -> Job:
         now_s = self.database.now_s(session)
