@@ -74,7 +74,11 @@ class Database:
         self._writing = sessionmaker(self.engine.execution_options(**{_WRITES: True}), expire_on_commit=False)
         try:
             self._create_tables()
+        except JobDatabaseError:
+            self.close()
+            raise
         except SQLAlchemyError as error:
+            self.close()
             cause = getattr(error, "orig", None) or error
             raise JobDatabaseError(
                 f"job database {self.shown_url} must be reachable and writable, got {type(cause).__name__}: "

@@ -64,7 +64,7 @@ class Leases:
         """The states of this dispatcher's jobs, without renewing."""
         query = select(Job.id, Job.state).where(Job.lease_owner == self.owner, Job.state.in_(HELD))
         with self.database.reading() as session:
-            return {job_id: State(state) for job_id, state in session.execute(query).tuples()}
+            return {row[0]: State(row[1]) for row in session.execute(query)}
 
     def take_over(self) -> list[str]:
         """Releases the jobs of processes that are gone or have not renewed their lease; returns their ids."""

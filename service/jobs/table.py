@@ -93,7 +93,7 @@ class JobTable:
     def counts(self) -> dict[State, int]:
         """How many jobs are in each state."""
         with self.database.reading() as session:
-            found = dict(session.execute(select(Job.state, func.count()).group_by(Job.state)).tuples().all())
+            found = {row[0]: row[1] for row in session.execute(select(Job.state, func.count()).group_by(Job.state))}
         return {state: int(found.get(state, 0)) for state in State}
 
     def change(
