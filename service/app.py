@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 _PROBLEM_OF_STATUS = {
+    400: "the body is no text",
     404: "no such scene",
     406: "Accept allows none of the formats",
     409: "several scenes have this name",

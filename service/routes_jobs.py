@@ -39,6 +39,17 @@ IdempotencyKey = Annotated[
 ]  # fmt: skip
 LOCATION = {"Location": {"description": "the job", "schema": {"type": "string"}}}
 BINARY = {"schema": {"type": "string", "format": "binary"}}
+EVENT_SCHEMA = {
+    "type": "object",
+    "required": ["id", "event", "data"],
+    "properties": {
+        "id": {"type": "string", "pattern": "^[0-9]+$"},
+        "event": {"type": "string"},
+        "data": {"type": "string", "contentMediaType": "application/json"},
+        "retry": {"type": "integer", "minimum": 0},
+    },
+}
+"""One event of the stream."""
 STREAM_HEADERS = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}
 
 
@@ -91,7 +102,7 @@ def _add_views(router: APIRouter, jobs: Jobs) -> None:
         "each with JSON data and a number; the stream ends when the job has. Last-Event-ID resumes it.",
         response_class=Response,
         responses=problem_responses(404, 422) | {
-            200: {"description": "the stream", "content": {"text/event-stream": {"schema": {"type": "string"}}}},
+            200: {"description": "the stream", "content": {"text/event-stream": {"schema": EVENT_SCHEMA}}},
             204: {"description": "the job has ended and the client has seen everything"},
         },
     )  # fmt: skip
