@@ -33,6 +33,11 @@ class Planner:
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="lightwell-plan")
         self._waiting = 0
 
+    @property
+    def num_waiting(self) -> int:
+        """Plans that wait or are being made."""
+        return self._waiting
+
     async def plan(self, source: str, settings: "Settings") -> dict[str, Any]:
         """A plan.
 
