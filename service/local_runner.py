@@ -100,9 +100,8 @@ def frame_preview(exr: bytes) -> bytes:
     from storage.frames import decode_frame
 
     radiance = decode_frame(exr)["radiance"]
-    light = luminance(radiance)
-    finite = light[np.isfinite(light)]
-    return encode(radiance, exposure_from_luminance([finite]) if finite.size else 1.0, PNG)
+    finite = radiance[np.isfinite(radiance).all(axis=-1)]
+    return encode(radiance, exposure_from_luminance([luminance(finite)]) if finite.size else 1.0, PNG)
 
 
 class LocalRunner:
