@@ -2,10 +2,11 @@
 
     GET  /v1/scenes                  what can be served
     POST /v1/scenes/{scene}/frame    a frame for a camera, as PNG, JPEG or EXR by Accept
+    POST /v1/jobs, GET ...           jobs, where the service runs them (service/routes_jobs.py)
     GET  /healthz                    the process answers
 
 Errors are problem documents (service/problems.py). Frames are rendered one after the other on one thread
-(service/rendering.py); bounds on the queue, jobs and authentication are not here yet, so listen on loopback.
+(service/rendering.py); bounds on the queue and authentication are not here yet, so listen on loopback.
 """
 
 import asyncio
@@ -13,7 +14,7 @@ import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from importlib.metadata import PackageNotFoundError, version
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from fastapi import FastAPI, Header, Response
 
@@ -22,8 +23,12 @@ from service.problems import PROBLEM, add_problem_handlers
 from service.rendering import Backend, RenderThread, StoreBackend
 from service.schemas import DEFAULT_MAX_PIXELS, FrameRequest
 
+if TYPE_CHECKING:
+    from service.jobs.service import Jobs
+
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 _PROBLEM_OF_STATUS = {
+    400: "the body is no text",
     404: "no such scene",
     406: "Accept allows none of the formats",
     409: "several scenes have this name",
@@ -59,6 +64,7 @@ def create_app(
     *,
     make_backend: Callable[[], Backend] | None = None,
     max_pixels: int = DEFAULT_MAX_PIXELS,
+    jobs: "Jobs | None" = None,
 ) -> FastAPI:
     """The service over one store.
 
@@ -66,6 +72,7 @@ def create_app(
         store_url: a folder or fsspec URL that holds a store.
         make_backend: what opens scenes instead of the store; called on the render thread.
         max_pixels: the largest frame that is answered.
+        jobs: jobs that the service runs; the app starts and closes them.
     """
     rendering = RenderThread(make_backend or (lambda: StoreBackend(store_url)))
 
@@ -73,8 +80,12 @@ def create_app(
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         try:
             await rendering.start()
+            if jobs is not None:
+                await asyncio.to_thread(jobs.start)
             yield
         finally:
+            if jobs is not None:
+                await asyncio.to_thread(jobs.close)
             rendering.close()
 
     app = FastAPI(
@@ -84,6 +95,10 @@ def create_app(
         lifespan=lifespan,
     )
     add_problem_handlers(app)
+    if jobs is not None:
+        from service.routes_jobs import add_job_routes
+
+        add_job_routes(app, jobs)
 
     @app.get("/healthz", summary="The process answers")
     async def healthz() -> dict[str, str]:

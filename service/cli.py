@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from service.failures import reported
+from service.jobs_cli import jobs_app
 from service.options import check_writable, parse_look_at, parse_overrides, parse_size
 from service.outcome import Outputs, finish, frame_request_lines
 
@@ -21,6 +22,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.add_typer(jobs_app, name="jobs")
 
 SceneArgument = Annotated[
     str,
@@ -257,7 +259,7 @@ def serve(
     host: Annotated[str, typer.Option("--host", help="address to listen on")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0 takes a free one")] = 8000,
 ) -> None:
-    """Answer frame requests over HTTP: POST /v1/scenes/{scene}/frame, GET /v1/scenes, /docs."""
+    """Run jobs and answer frame requests over HTTP: POST /v1/jobs, POST /v1/scenes/{scene}/frame, /docs."""
     with reported():
         from service.serving import serve_store
 

@@ -23,3 +23,43 @@ class NotAcceptableError(ServiceError, ValueError):
 
 class FrameTooLargeError(ServiceError, ValueError):
     """More pixels were asked for than this service answers at once."""
+
+
+class UnknownJobError(ServiceError, LookupError):
+    """No job has this id."""
+
+
+class JobStateError(ServiceError, ValueError):
+    """What was asked cannot happen in the state that the job is in."""
+
+
+class JobRequestError(ServiceError, ValueError):
+    """A submission asks for what no job can do."""
+
+
+class IdempotencyError(ServiceError, ValueError):
+    """An Idempotency-Key came back with another request than it came with first."""
+
+
+class NotReadyError(ServiceError, LookupError):
+    """The job exists; what was asked of it does not yet."""
+
+
+class BusyError(ServiceError, RuntimeError):
+    """More was asked at once than the service takes; asking again later helps."""
+
+
+class JobDatabaseError(ServiceError, OSError):
+    """The job database cannot be reached or is not ours."""
+
+
+class LeaseLostError(ServiceError, RuntimeError):
+    """Another process runs the job now; what this one has to say about it no longer counts."""
+
+
+class UnreachableError(ServiceError, OSError):
+    """No service answers at an address."""
+
+
+class RequestRefusedError(ServiceError, ValueError):
+    """A service answered a request of ours with an error."""

@@ -7,22 +7,36 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
 
 from models.errors import ModelError
 from service import errors
 from storage.errors import StorageError
-from workers.errors import CameraError, WorkerError
+from workers.errors import CameraError, SceneError, WorkerError
+from workers.job_spec import JobSpecError
+from workers.settings import SettingsError
 
 PROBLEM = "application/problem+json"
 log = logging.getLogger("lightwell.service")
 
 STATUS_OF_ERROR: dict[type[Exception], int] = {
     errors.UnknownSceneError: 404,
+    errors.UnknownJobError: 404,
     errors.NotAcceptableError: 406,
     errors.AmbiguousSceneError: 409,
+    errors.JobStateError: 409,
+    errors.NotReadyError: 409,
     errors.FrameTooLargeError: 413,
+    errors.IdempotencyError: 422,
+    errors.JobRequestError: 422,
     CameraError: 422,
+    JobSpecError: 422,
+    SceneError: 422,
+    SettingsError: 422,
+    errors.BusyError: 503,
+    errors.JobDatabaseError: 503,
+    SQLAlchemyError: 503,
     errors.ServiceError: 500,
     WorkerError: 500,
     StorageError: 500,
@@ -31,6 +45,24 @@ STATUS_OF_ERROR: dict[type[Exception], int] = {
 }
 """The most derived class that is listed decides."""
 
+RETRY_AFTER_S = 5
+PROBLEM_SCHEMA: dict[str, Any] = {
+    "type": "object",
+    "required": ["title", "status", "detail"],
+    "properties": {
+        "title": {"type": "string"},
+        "status": {"type": "integer"},
+        "detail": {"type": "string"},
+        "errors": {"type": "array", "items": {"type": "object", "required": ["where", "message"]}},
+    },
+}
+
+
+def problem_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """What a route's `responses` says of these statuses."""
+    content = {PROBLEM: {"schema": PROBLEM_SCHEMA}}
+    return {status: {"description": HTTPStatus(status).phrase, "content": content} for status in statuses}
+
 
 def problem(status: int, detail: str, **extra: Any) -> JSONResponse:
     """A problem document; `title` is the status' own phrase, so `type` is about:blank and left out."""
@@ -38,12 +70,21 @@ def problem(status: int, detail: str, **extra: Any) -> JSONResponse:
     return JSONResponse(content, status_code=status, media_type=PROBLEM)
 
 
+def _detail(error: Exception) -> str:
+    if isinstance(error, SQLAlchemyError):  # its message holds the statement and its values
+        return f"the job database does not answer ({type(error).__name__}); ask again later"
+    return " ".join(str(error).split())
+
+
 def _known_error(_: Request, error: Exception) -> JSONResponse:
     status = next(STATUS_OF_ERROR[kind] for kind in type(error).__mro__ if kind in STATUS_OF_ERROR)
-    detail = " ".join(str(error).split()) or "not enough memory for this frame; choose a smaller size"
+    detail = _detail(error) or "not enough memory for this frame; choose a smaller size"
     if status >= 500:
         log.error("%s: %s", type(error).__name__, detail)
-    return problem(status, detail)
+    response = problem(status, detail)
+    if status == HTTPStatus.SERVICE_UNAVAILABLE:
+        response.headers["Retry-After"] = str(RETRY_AFTER_S)
+    return response
 
 
 def _invalid_request(_: Request, error: Exception) -> JSONResponse:

@@ -1,12 +1,17 @@
 """Stand-ins for what workers hand to the service: an evaluation, and scenes that answer at once."""
 
+import contextlib
 import threading
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pytest
+import uvicorn
+
+from service.serving import bind
 
 SCORES = {"psnr": 30.0, "ssim": 0.9, "flip": 0.1, "st_lpips": 0.2, "relmse": 0.05, "temporal": 0.01}
 
@@ -122,3 +127,28 @@ def evaluation() -> FakeEvaluation:
 @pytest.fixture
 def backend() -> FakeBackend:
     return FakeBackend()
+
+
+@contextlib.contextmanager
+def served(app: Any) -> Iterator[str]:
+    """A real server on a free port of loopback; yields its URL."""
+    with bind("127.0.0.1", 0) as listener:
+        config = uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1)
+        server = uvicorn.Server(config)
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        deadline_s = time.monotonic() + 10
+        while not server.started and thread.is_alive() and time.monotonic() < deadline_s:
+            time.sleep(0.01)
+        try:
+            assert server.started, "the server did not start"
+            yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+        finally:
+            server.should_exit = True
+            thread.join(30)
+
+
+@pytest.fixture(scope="session")
+def serve_app() -> Callable[[Any], contextlib.AbstractContextManager[str]]:
+    """Serves an app: `with serve_app(app) as url`."""
+    return served

@@ -226,7 +226,7 @@ def test_a_broken_scene_is_one_line_and_leaves_no_store(calls: Any, store: str) 
 
 @pytest.mark.parametrize(
     "arguments",
-    [("evaluate", "scene.xml"), ("frame", "tabletop", "--look-at", "0,1,5,0,1,0", "-o", "f.png"), ("serve",)],
+    [("evaluate", "scene.xml"), ("frame", "tabletop", "--look-at", "0,1,5,0,1,0", "-o", "f.png")],
 )
 def test_a_store_that_is_missing_is_one_line(calls: Any, store: str, arguments: tuple[str, ...]) -> None:
     assert_mistake(invoke(*arguments, "--store", store), store)
