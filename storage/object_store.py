@@ -41,7 +41,7 @@ def open_filesystem(url: str) -> tuple[AbstractFileSystem, str]:
     try:
         filesystem, root = url_to_fs(url, **options)
     except ImportError as error:
-        package = _EXTRAS.get(protocol, f"the package that fsspec asks for, {error.name}")
+        package = _EXTRAS.get(protocol, "it")
         raise StoreUrlError(f"store {url} must have its package installed, got: {error}; install {package}") from error
     except ValueError as error:
         raise StoreUrlError(

@@ -146,8 +146,7 @@ def _marker_problems(
             fields = store.parse_marker(path, data, ref) or {"files": {}}
             stored = {layout.stored_file(ref.folder, name, entry): entry for name, entry in fields["files"].items()}
         except (DamagedUnitError, PathNameError) as error:
-            removes = (path, ref.folder) if plain_unit else (set_marker, path)
-            yield Problem(str(error), removes, ref, index)
+            yield Problem(str(error), (path, ref.folder) if plain_unit else (set_marker, path), ref, index)
             continue
         for file, entry in stored.items():
             removes = (set_marker, ref.folder) if plain_unit else (set_marker, path, file)
