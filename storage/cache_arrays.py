@@ -18,7 +18,7 @@ from storage import layout
 from storage.durable import FileTree
 from storage.errors import CacheMismatchError
 
-METADATA = "zarr.json"
+METADATA = layout.ZARR_METADATA
 _ZSTD_LEVEL = 1  # noisy floats hardly shrink; a higher level only costs time
 
 

@@ -13,6 +13,7 @@ import zarr
 
 from storage import cache_arrays, layout, markers
 from storage.cache_arrays import ArraySpec
+from storage.cache_reading import read_arrays
 from storage.errors import CacheMismatchError, DamagedUnitError, MissingUnitError, StorageError
 from storage.keys import plain, seed_from_key
 from storage.layout import UnitRef
@@ -72,11 +73,12 @@ class CacheSet:
             DamagedUnitError: zarr's own metadata cannot be read, or differs from the commit marker.
         """
         folder = layout.caches_folder(ref.folder)
-        if not store.files.exists(folder):
+        committed = store.committed(ref)
+        if committed is None and not store.files.names(folder):
             raise MissingUnitError(
                 f"cache set {ref} must be in store {store.url}, got no {store.files.path(folder)}; run the bake first"
             )
-        for name, entry in ((store.committed(ref) or {}).get("files") or {}).items():
+        for name, entry in (committed or {"files": {}})["files"].items():
             if problem := difference(store.files.read(f"{ref.folder}/{name}"), entry):
                 raise store.damage(ref, f"{ref.folder}/{name}", problem)
         with _opening(store, ref):
@@ -124,8 +126,9 @@ class CacheSet:
             chunk = layout.chunk_file(name, index, array.ndim)
             files[chunk] = markers.file_entry(self._write_chunk(index, name, array, chunk))
         fields = markers.compose({**self.store.own_fields(self.ref, files), **own}, record)
-        self.store.files.write(layout.bake_marker(self.ref.folder, index), markers.seal(fields))
-        return fields
+        if self.store.files.write_new(layout.bake_marker(self.ref.folder, index), markers.seal(fields)):
+            return fields
+        return self.unit_record(index) or fields
 
     def unit_seed(self, index: int) -> int:
         """The seed of a bake unit, from the set's key."""
@@ -146,8 +149,13 @@ class CacheSet:
         return self.store.read_marker(layout.bake_marker(self.ref.folder, index), self.ref)
 
     def discard_unit(self, index: int) -> None:
-        """Takes one unit's marker away, so that the unit is baked again."""
-        self.store.files.remove(layout.bake_marker(self.ref.folder, index))
+        """Takes one unit's marker away, and the set's own, so that the unit is baked again."""
+        self.store.files.remove_file(layout.unit_marker(self.ref.folder))
+        self.store.files.remove_file(layout.bake_marker(self.ref.folder, index))
+
+    def quarantine_unit(self, index: int, reason: str, facts: Mapping[str, Any]) -> dict[str, Any]:
+        """Records why a bake unit was set aside; see `Store.quarantine`."""
+        return self.store.quarantine(self.ref, reason, unit=index, facts=facts)
 
     def commit(self, record: Mapping[str, Any]) -> dict[str, Any]:
         """Marks the whole set as done, so that `Store.units` and `Store.committed` know it.
@@ -171,8 +179,9 @@ class CacheSet:
         files = {path: markers.file_entry(data) for path, data in contents.items()}
         own = {**self.store.own_fields(self.ref, files), "num_units": self.num_units}
         fields = markers.compose(own, record)
-        self.store.files.write(layout.unit_marker(self.ref.folder), markers.seal(fields))
-        return fields
+        if self.store.files.write_new(layout.unit_marker(self.ref.folder), markers.seal(fields)):
+            return fields
+        return self.store.committed(self.ref) or fields
 
     def load(self) -> dict[str, np.ndarray]:
         """Reads all arrays into memory and verifies every row.
@@ -182,22 +191,16 @@ class CacheSet:
             DamagedUnitError: a chunk differs from its marker.
         """
         self._check_complete()
-        arrays = {spec.name: np.empty(spec.shape, spec.dtype) for spec in self.specs.values()}
-        for index in range(self.num_units):
-            record = self.unit_record(index)
-            if record is None:
-                raise self._missing([index])
-            digests = record["rows_sha256"]
-            if digests.keys() != self.specs.keys():
-                raise self._damaged(index, layout.caches_folder(self.ref.folder), f"lacks {sorted(digests)}")
-            for name, digest in digests.items():
-                arrays[name][self.specs[name].rows(index)] = self._read_chunk(index, self.specs[name], digest)
-        return arrays
+        return read_arrays(self)
+
+    def array(self, name: str) -> zarr.Array:
+        """An array as zarr sees it, unverified."""
+        return self._arrays[name]
 
     def _check_complete(self) -> None:
         missing = sorted(set(range(self.num_units)) - self.committed_units())
         if missing:
-            raise self._missing(missing)
+            raise self.missing(missing)
 
     def _write_chunk(self, index: int, name: str, array: np.ndarray, chunk: str) -> bytes:
         """Writes a chunk, forces it to the disk and returns the bytes that lie there."""
@@ -207,18 +210,6 @@ class CacheSet:
             self._arrays[name][self.specs[name].rows(index)] = array
             files.sync(path)
             return files.filesystem.cat_file(files.path(path))
-
-    def _read_chunk(self, index: int, spec: ArraySpec, digest: str) -> np.ndarray:
-        path = f"{self.ref.folder}/{layout.chunk_file(spec.name, index, len(spec.shape))}"
-        if not self.store.files.exists(path):
-            raise self._missing([index], f" (no {self.store.files.path(path)})")
-        try:
-            rows = np.ascontiguousarray(self._arrays[spec.name][spec.rows(index)])
-        except Exception as error:  # a checksum, the decompressor or a size: each codec has its own error
-            raise self._damaged(index, path, f"cannot be decoded: {error}") from error
-        if markers.sha256_hex(rows.data) != digest:
-            raise self._damaged(index, path, "differs from its SHA-256")
-        return rows
 
     def _check_rows(self, index: int, rows: Mapping[str, np.ndarray]) -> None:
         if not 0 <= index < self.num_units:
@@ -235,19 +226,22 @@ class CacheSet:
                     f"got {array.dtype.name} {array.shape}; convert them"
                 )
 
-    def _missing(self, indices: Sequence[int], reason: str = "") -> MissingUnitError:
+    def missing(self, indices: Sequence[int], reason: str = "") -> MissingUnitError:
+        """The error for bake units that are not there."""
         more = ", ..." if len(indices) > _SHOWN else ""
         shown = ", ".join(str(index) for index in indices[:_SHOWN]) + more
         return MissingUnitError(
             f"cache set {self.ref} in store {self.store.url} must hold all of its {self.num_units} units, "
             f"got {len(indices)} without: {shown}{reason}; "
-            "call discard_unit on those that are marked, then run the bake again"
+            f"run: lightwell verify --store {self.store.url} --repair, then run the scene again"
         )
 
-    def _damaged(self, index: int, path: str, problem: str) -> DamagedUnitError:
+    def damaged(self, index: int, path: str, problem: str) -> DamagedUnitError:
+        """The error for a bake unit that is not what its marker promises."""
         return DamagedUnitError(
             f"bake unit {index} of {self.ref} in store {self.store.url} must hold what its marker promises, "
-            f"but {self.store.files.path(path)} {problem}; call discard_unit({index}) and run the bake again"
+            f"but {self.store.files.path(path)} {problem}; "
+            f"run: lightwell verify --store {self.store.url} --repair, then run the scene again"
         )
 
 
@@ -259,4 +253,6 @@ def _opening(store: Store, ref: UnitRef) -> Iterator[None]:
         raise
     except Exception as error:  # zarr answers bad metadata with JSON, key, type or its own errors
         path = layout.caches_folder(ref.folder)
+        if refused := store.files.refusal(error, path, "readable"):
+            raise refused from error
         raise store.damage(ref, path, f"cannot be opened: {type(error).__name__}: {error}") from error

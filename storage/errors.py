@@ -17,7 +17,23 @@ class StoreVersionError(StorageError, ValueError):
 
 
 class StoreWriteError(StorageError, OSError):
-    """The file system refused a write (disk full, no permission, network gone)."""
+    """The file system refused a write (disk full, quota, read-only)."""
+
+
+class StoreReadError(StorageError, OSError):
+    """The file system could not read what is there (a failing disk, a remote store that answers with an error)."""
+
+
+class StoreAccessError(StorageError, PermissionError):
+    """The file system or the remote store denied a read or a write."""
+
+
+class StoreUnreachableError(StorageError, ConnectionError):
+    """The remote store does not answer."""
+
+
+class StoreUrlError(StorageError, ValueError):
+    """The URL of a store names no bucket, no known protocol, or a package that is not installed."""
 
 
 class SceneNotFoundError(StorageError, LookupError):

@@ -2,32 +2,43 @@
 everywhere.
 
 store.json                                      layout version; a folder without it is no store
+quarantine/<digest>/<stage>/<key>/unit.json     why a unit was set aside; a bake unit: 000042.json
 scenes/<digest>/scene.json                      name and facts of a scene
 scenes/<digest>/<stage>/<key>/<files>           one unit
 scenes/<digest>/<stage>/<key>/commit.json       its marker, written last
 scenes/<digest>/bake/<key>/caches.zarr/         a cache set: zarr v3 arrays, one chunk per bake unit
 scenes/<digest>/bake/<key>/units/000042.json    marker of one bake unit
 .../.<name>.<random>.partial                    being written, or left by a crash: never read
+
+In a remote store a unit's files are <sha256>.<name>: writers of different bytes never meet, and the one marker
+that is put decides. The marker's file entry says so in "at"; a reader needs nothing else, so a store may be
+copied between a folder and a bucket.
 """
 
 import re
 import uuid
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from storage.errors import PathNameError
 
-LAYOUT_VERSION = 1
+LAYOUT_VERSION = 2  # 2: store.json and scene.json carry a checksum
+READABLE_LAYOUTS = (1, 2)
 STORE_FILE = "store.json"
 SCENES = "scenes"
 SCENE_FILE = "scene.json"
 MARKER = "commit.json"
 CACHES = "caches.zarr"
 UNIT_MARKERS = "units"
+QUARANTINE = "quarantine"
+ZARR_METADATA = "zarr.json"
 
 _SEGMENT = re.compile(r"[0-9A-Za-z][0-9A-Za-z_.-]{0,127}")
 _UNIT_MARKER = re.compile(r"(\d{6,})\.json")
 _MAX_NAME_NBYTES = 200  # file systems allow 255; the temporary name needs the rest
 _PARTIAL = ".partial"
+_OBJECT_DIGITS = 16  # of the SHA-256: tells the few files of one name and unit apart
 
 
 @dataclass(frozen=True)
@@ -85,6 +96,33 @@ def chunk_file(array: str, index: int, num_axes: int) -> str:
     return "/".join([CACHES, array, "c", str(index), *["0"] * (num_axes - 1)])
 
 
+def object_name(name: str, sha256: str) -> str:
+    """Name of a unit's file in a remote store."""
+    return f"{sha256[:_OBJECT_DIGITS]}.{file_name(name)}"
+
+
+def stored_file(folder: str, name: str, entry: Mapping[str, Any]) -> str:
+    """Path of a file that a marker speaks of.
+
+    Raises:
+        PathNameError: the marker names a place outside its unit.
+    """
+    at = str(entry.get("at", name))
+    if any(part in ("", ".", "..") for part in at.split("/")):
+        raise PathNameError(f"file of {folder} must lie in its unit, got {at!r}; the marker is not ours")
+    return f"{folder}/{at}"
+
+
+def quarantine_folder(digest: str = "") -> str:
+    return f"{QUARANTINE}/{_segment('scene digest', digest)}" if digest else QUARANTINE
+
+
+def quarantine_file(ref: UnitRef, unit: int | None) -> str:
+    """Path of the record that says why a unit, or one bake unit of a cache set, was set aside."""
+    name = "unit.json" if unit is None else f"{unit:06d}.json"
+    return f"{QUARANTINE}/{ref.folder.removeprefix(SCENES + '/')}/{name}"
+
+
 def bake_markers_folder(folder: str) -> str:
     return f"{folder}/{UNIT_MARKERS}"
 
@@ -111,7 +149,8 @@ def is_segment(name: str) -> bool:
 
 
 def is_partial(name: str) -> bool:
-    return name.startswith(".") and name.endswith(_PARTIAL)
+    """Whether a file is being written, or was when a process died; zarr's own end like ours."""
+    return name.endswith(_PARTIAL)
 
 
 def file_name(name: str) -> str:
@@ -122,10 +161,10 @@ def file_name(name: str) -> str:
     """
     printable = isinstance(name, str) and name.isprintable() and not set(name) & set('/\\:*?"<>|')
     fits = printable and 0 < len(name.encode("utf-8", "surrogatepass")) <= _MAX_NAME_NBYTES
-    if not fits or name.startswith(".") or name in (MARKER, UNIT_MARKERS, CACHES):
+    if not fits or name.startswith(".") or is_partial(name) or name in (MARKER, UNIT_MARKERS, CACHES):
         raise PathNameError(
             f"file name must be one visible path segment of at most {_MAX_NAME_NBYTES} bytes other than "
-            f"{MARKER}, {UNIT_MARKERS} and {CACHES}, got {name!r}; rename it"
+            f"{MARKER}, {UNIT_MARKERS}, {CACHES} and *{_PARTIAL}, got {name!r}; rename it"
         )
     return name
 

@@ -9,11 +9,12 @@ from functools import cache
 from importlib import metadata
 from typing import Any
 
+from storage import layout
 from storage.errors import CanonicalError
 from storage.keys import canonical_json, plain
 from storage.layout import LAYOUT_VERSION
 
-_CHECKSUM = "marker_sha256"
+CHECKSUM = "marker_sha256"
 _LIBRARIES = ("numpy", "zarr", "OpenEXR", "safetensors")
 
 
@@ -24,6 +25,15 @@ def sha256_hex(data: bytes | memoryview) -> str:
 def file_entry(data: bytes) -> dict[str, Any]:
     """What a marker says of a file: its SHA-256 and its size."""
     return {"sha256": sha256_hex(data), "nbytes": len(data)}
+
+
+def stored_entries(files: Mapping[str, bytes], *, by_content: bool) -> dict[str, dict[str, Any]]:
+    """What a marker says of a unit's files; `by_content` gives each a name of its own for its bytes ("at")."""
+    entries = {layout.file_name(name): file_entry(data) for name, data in files.items()}
+    if by_content:
+        for name, entry in entries.items():
+            entry["at"] = layout.object_name(name, entry["sha256"])
+    return entries
 
 
 def compose(own: Mapping[str, Any], record: Mapping[str, Any]) -> dict[str, Any]:
@@ -52,8 +62,8 @@ def compose(own: Mapping[str, Any], record: Mapping[str, Any]) -> dict[str, Any]
 
 def seal(fields: Mapping[str, Any]) -> bytes:
     """Writes a marker as readable JSON that carries a checksum of itself."""
-    body = {name: value for name, value in plain(fields, "marker").items() if name != _CHECKSUM}
-    body[_CHECKSUM] = sha256_hex(canonical_json(body))
+    body = {name: value for name, value in plain(fields, "marker").items() if name != CHECKSUM}
+    body[CHECKSUM] = sha256_hex(canonical_json(body))
     return json.dumps(body, indent=1, sort_keys=True).encode()
 
 
@@ -64,7 +74,7 @@ def unseal(data: bytes) -> dict[str, Any]:
         ValueError: these bytes are no marker, or not the ones that were written.
     """
     fields = json.loads(data)
-    if not isinstance(fields, dict) or fields.pop(_CHECKSUM, None) != sha256_hex(canonical_json(fields)):
+    if not isinstance(fields, dict) or fields.pop(CHECKSUM, None) != sha256_hex(canonical_json(fields)):
         raise ValueError("its content does not match its own checksum")
     return fields
 

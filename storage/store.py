@@ -1,22 +1,15 @@
 """The content-addressed store: units committed whole, resumed by their markers, verified on every read."""
 
-import json
 import os
 from collections.abc import Mapping
 from typing import Any
 
-from storage import layout, markers
+from storage import layout, markers, quarantine, scenes
 from storage.durable import FileTree
-from storage.errors import (
-    DamagedUnitError,
-    MissingUnitError,
-    SceneNotFoundError,
-    StoreNotFoundError,
-    StoreVersionError,
-)
-from storage.keys import plain, seed_from_key
+from storage.errors import DamagedUnitError, MissingUnitError, StoreNotFoundError, StoreVersionError
+from storage.keys import seed_from_key
 from storage.layout import UnitRef
-from storage.verification import difference, verify_store
+from storage.verification import difference, find_problems
 
 
 class Store:
@@ -24,6 +17,7 @@ class Store:
 
     def __init__(self, files: FileTree) -> None:
         self.files = files
+        self.layout_version = layout.LAYOUT_VERSION
 
     @classmethod
     def open(cls, url: str | os.PathLike[str], *, create: bool = False) -> "Store":
@@ -36,18 +30,24 @@ class Store:
         Raises:
             StoreNotFoundError: there is no store at the URL and `create` is false.
             StoreVersionError: the store has another layout than this code.
-            StoreWriteError: the store could not be created.
+            StorageError: the store could not be created: no such bucket, access denied, no answer, disk full.
         """
         store = cls(FileTree(url))
-        if not store.files.exists(layout.STORE_FILE):
+        header = store.files.read(layout.STORE_FILE)
+        if header is None:
             if not create:
                 raise StoreNotFoundError(
                     f"store must be a folder with {layout.STORE_FILE}, got {store.url}, which has none; "
                     "check the path, or open it with create=True"
                 )
-            store.files.write(layout.STORE_FILE, _pretty({"layout_version": layout.LAYOUT_VERSION}))
-        store._check_version()
+            store.write_header()
+            header = store.files.read(layout.STORE_FILE)
+        store._check_version(header)
         return store
+
+    def write_header(self) -> None:
+        """Says that here is a store; a header that is there is replaced."""
+        self.files.write(layout.STORE_FILE, markers.seal({"layout_version": layout.LAYOUT_VERSION}))
 
     @property
     def url(self) -> str:
@@ -68,9 +68,7 @@ class Store:
         Returns:
             The scene's entry: `digest`, `name` and the facts.
         """
-        entry = {"name": digest, **plain(dict(info), "info"), "digest": digest}
-        self.files.write(layout.scene_file(digest), _pretty(entry))
-        return entry
+        return scenes.register(self.files, digest, info)
 
     def scenes(self) -> list[dict[str, Any]]:
         """Lists the registered scenes by name.
@@ -78,10 +76,7 @@ class Store:
         Raises:
             DamagedUnitError: a scene's entry cannot be read.
         """
-        digests = filter(layout.is_segment, self.files.names(layout.SCENES))
-        files = [layout.scene_file(digest) for digest in digests]
-        entries = [self._read_json(file) for file in files if self.files.exists(file)]
-        return sorted(entries, key=lambda entry: (str(entry["name"]), entry["digest"]))
+        return scenes.entries(self.files, self.layout_version)
 
     def find_scene(self, name_or_digest: str) -> dict[str, Any]:
         """Finds a scene by digest, by name or by a digest's first six or more digits.
@@ -89,18 +84,7 @@ class Store:
         Raises:
             SceneNotFoundError: none or several match.
         """
-        scenes = self.scenes()
-        matches = [scene for scene in scenes if scene["digest"] == name_or_digest]
-        matches = matches or [scene for scene in scenes if scene["name"] == name_or_digest]
-        if not matches and len(name_or_digest) >= 6:
-            matches = [scene for scene in scenes if scene["digest"].startswith(name_or_digest)]
-        if len(matches) == 1:
-            return matches[0]
-        known = ", ".join(f"{scene['name']} ({scene['digest']})" for scene in matches or scenes) or "none"
-        raise SceneNotFoundError(
-            f"scene must match one in {self.url}, got {name_or_digest!r} with {len(matches)} matches; "
-            f"{'tell them apart by digest' if matches else 'known scenes'}: {known}"
-        )
+        return scenes.find(self.scenes(), name_or_digest, self.url)
 
     # ----------------------------------------------------------------- units
 
@@ -124,10 +108,12 @@ class Store:
         existing = self.committed(ref)
         if existing is not None:
             return existing
-        entries = {layout.file_name(name): markers.file_entry(data) for name, data in files.items()}
+        entries = markers.stored_entries(files, by_content=not self.files.is_local)
         fields = markers.compose(self.own_fields(ref, entries), record)
-        self.files.publish(ref.folder, {**files, layout.MARKER: markers.seal(fields)})
-        return self.committed(ref) or fields
+        stored = {entries[name].get("at", name): data for name, data in files.items()}
+        if self.files.publish(ref.folder, {**stored, layout.MARKER: markers.seal(fields)}):
+            return fields
+        return self._record(ref)
 
     def committed(self, ref: UnitRef) -> dict[str, Any] | None:
         """Fields of a unit's marker; None where the unit is not committed.
@@ -149,30 +135,54 @@ class Store:
             raise MissingUnitError(
                 f"file must be one of {sorted(files)} in unit {ref} of {self.url}, got {name!r}; check the name"
             )
-        data = self.files.read(layout.unit_file(ref.folder, name))
+        path = layout.stored_file(ref.folder, name, files[name])
+        data = self.files.read(path)
         problem = difference(data, files[name])
         if data is None or problem:
-            raise self.damage(ref, f"{ref.folder}/{name}", problem)
+            raise self.damage(ref, path, problem)
         return data
 
     def discard(self, ref: UnitRef) -> None:
         """Removes a unit, marker first, so that it is planned again; nothing happens where there is none."""
-        self.files.remove(layout.unit_marker(ref.folder))
+        self.files.remove_file(layout.unit_marker(ref.folder))
         self.files.remove(ref.folder)
 
     def units(self, scene_digest: str, stage: str) -> list[UnitRef]:
         """Lists the committed units of a stage by key."""
-        keys = self.files.names(layout.stage_folder(scene_digest, stage))
-        refs = [UnitRef(scene_digest, stage, key) for key in keys if layout.is_segment(key)]
-        return [ref for ref in refs if self.files.exists(layout.unit_marker(ref.folder))]
+        keys = self.files.folders_with(layout.stage_folder(scene_digest, stage), layout.MARKER)
+        return [UnitRef(scene_digest, stage, key) for key in keys if layout.is_segment(key)]
 
     def nbytes(self, ref: UnitRef) -> int:
         """Bytes that a unit takes at rest, its markers included; 0 where there is none."""
         return self.files.nbytes(ref.folder)
 
+    # ---------------------------------------------------------------- health
+
     def verify(self) -> list[str]:
         """Checks every byte that a marker speaks for. Returns one sentence a problem, or an empty list."""
-        return verify_store(self)
+        return [problem.text for problem in find_problems(self)]
+
+    def quarantine(
+        self, ref: UnitRef, reason: str, *, cause: quarantine.Cause = "health", unit: int | None = None,
+        facts: Mapping[str, Any] | None = None,
+    ) -> dict[str, Any]:  # fmt: skip
+        """Records why a unit was set aside. It stays uncommitted, so the next run computes it again.
+
+        Args:
+            ref: the unit, or the cache set of a bake unit.
+            reason: one sentence for people.
+            cause: "health" (over a limit when it was made) or "damage" (at rest).
+            unit: index of the bake unit; None for a whole unit.
+            facts: JSON-like: counts, limits.
+
+        Returns:
+            The record: address, `unit`, `cause`, `reason`, `facts`, `attempts` (1 at first), `created_unix_s`.
+        """
+        return quarantine.put(self, ref, reason, cause=cause, unit=unit, facts=facts or {})
+
+    def quarantined(self, scene_digest: str = "") -> list[dict[str, Any]]:
+        """Records of the units that were set aside and are not committed since; of all scenes or of one."""
+        return quarantine.standing(self, scene_digest)
 
     # ----------------------------------- for the other modules of this package
 
@@ -192,7 +202,14 @@ class Store:
         Raises:
             DamagedUnitError: it is unreadable or speaks of another unit.
         """
-        data = self.files.read(relative)
+        return self.parse_marker(relative, self.files.read(relative), ref)
+
+    def parse_marker(self, relative: str, data: bytes | None, ref: UnitRef) -> dict[str, Any] | None:
+        """Fields of a marker that was read; None where there is none.
+
+        Raises:
+            DamagedUnitError: it is unreadable or speaks of another unit.
+        """
         if data is None:
             return None
         try:
@@ -207,8 +224,8 @@ class Store:
         """The error for a file that is not what its marker promises."""
         return DamagedUnitError(
             f"unit {ref} in store {self.url} must hold what its marker promises, "
-            f"but {self.files.path(relative)} {problem}; discard the unit "
-            "(one bake unit: CacheSet.discard_unit) and run its stage again"
+            f"but {self.files.path(relative)} {problem}; run: lightwell verify "
+            f"--store {self.url} --repair, then run the scene again"
         )
 
     def _record(self, ref: UnitRef) -> dict[str, Any]:
@@ -220,27 +237,14 @@ class Store:
             )
         return record
 
-    def _read_json(self, relative: str) -> dict[str, Any]:
-        try:
-            content = json.loads(self.files.read(relative) or b"")
-            if isinstance(content, dict):
-                return content
-            problem = f"a {type(content).__name__}"
-        except ValueError as error:
-            problem = str(error)
-        raise DamagedUnitError(
-            f"{self.files.path(relative)} in store {self.url} must hold a JSON object, got {problem}; "
-            "remove the file and submit the scene again"
-        )
-
-    def _check_version(self) -> None:
-        version = self._read_json(layout.STORE_FILE).get("layout_version")
-        if version != layout.LAYOUT_VERSION:
+    def _check_version(self, header: bytes | None) -> None:
+        unsealed = scenes.parse(self.files, layout.STORE_FILE, header, min(layout.READABLE_LAYOUTS))
+        version = unsealed.get("layout_version")
+        if version not in layout.READABLE_LAYOUTS:
             raise StoreVersionError(
                 f"store {self.url} must have layout version {layout.LAYOUT_VERSION}, got {version!r}; "
                 "open it with the release that wrote it, or start a new store"
             )
-
-
-def _pretty(content: Mapping[str, Any]) -> bytes:
-    return json.dumps(content, indent=1, sort_keys=True, ensure_ascii=False).encode()
+        if version >= 2:
+            scenes.parse(self.files, layout.STORE_FILE, header, version)
+        self.layout_version = version

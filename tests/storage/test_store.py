@@ -27,6 +27,7 @@ from storage.errors import (
 )
 from storage.keys import seed_from_key
 from storage.store import Store, UnitRef
+from storage.verification import find_problems, repair
 
 DIGEST = "0123456789abcdef"
 REF = UnitRef(DIGEST, "render", "ab" * 16)
@@ -47,7 +48,8 @@ class StoreContract:
         return store
 
     def raw_path(self, store: Store, name: str) -> str:
-        return store.files.path(f"{REF.folder}/{name}")
+        entry = {} if name == layout.MARKER else (store.committed(REF) or {"files": {}})["files"].get(name, {})
+        return store.files.path(layout.stored_file(REF.folder, name, entry))
 
     def raw_get(self, store: Store, name: str) -> bytes:
         with store.files.filesystem.open(self.raw_path(store, name), "rb") as file:
@@ -74,7 +76,7 @@ class StoreContract:
 
     def test_open_refuses_a_damaged_header(self, store: Store, url: str) -> None:
         store.files.write(layout.STORE_FILE, b'{"layout_ver')
-        with pytest.raises(DamagedUnitError, match="must hold a JSON object"):
+        with pytest.raises(DamagedUnitError, match="must hold the JSON object"):
             Store.open(url)
 
     def test_store_survives_pickling(self, store: Store) -> None:
@@ -161,13 +163,13 @@ class StoreContract:
 
     def test_read_finds_a_deleted_file(self, store: Store) -> None:
         store.commit(REF, FILES, {})
-        store.files.filesystem.rm(self.raw_path(store, "frame.exr"))
+        store.files.filesystem.rm_file(self.raw_path(store, "frame.exr"))
         self.check_damage(store, "is missing")
 
     def check_damage(self, store: Store, problem: str) -> None:
         with pytest.raises(DamagedUnitError, match=problem) as caught:
             store.read(REF, "frame.exr")
-        for part in (REF.key, store.url, self.raw_path(store, "frame.exr"), "discard the unit"):
+        for part in (REF.key, store.url, self.raw_path(store, "frame.exr"), "verify --store"):
             assert part in str(caught.value)
         assert store.verify() == [str(caught.value)]
         store.discard(REF)
@@ -194,12 +196,14 @@ class StoreContract:
 
     def test_missing_marker_means_not_committed(self, store: Store) -> None:
         store.commit(REF, FILES, {})
-        store.files.filesystem.rm(self.raw_path(store, "commit.json"))
+        store.files.filesystem.rm_file(self.raw_path(store, "commit.json"))
         assert store.committed(REF) is None
         assert store.units(DIGEST, "render") == []
         assert "has no commit marker" in store.verify()[0]
         store.commit(REF, {"frame.exr": b"again"}, {})
         assert store.read(REF, "frame.exr") == b"again"
+        assert all("belongs to no commit" in text for text in store.verify())  # files of a commit without marker
+        assert all([repair(store, problem) for problem in find_problems(store)])
         assert store.verify() == []
 
     def test_discard_forgets_the_unit(self, store: Store) -> None:
@@ -223,6 +227,12 @@ class StoreContract:
             store.files.write(place, b"x")
         store.commit(REF, FILES, {})
         assert (len(store.scenes()), store.units(DIGEST, "render"), store.verify()) == (1, [REF], [])
+
+
+class TestS3Store(StoreContract):
+    @pytest.fixture
+    def url(self, s3_bucket: str) -> str:
+        return f"s3://{s3_bucket}/Läger [1] #2"
 
 
 class TestMemoryStore(StoreContract):
