@@ -82,10 +82,11 @@ def run_evaluation(
                 advance(note=name)
     milliseconds = _interleaved_times(run, methods)
     positions = [_positions(renderer, camera) for camera in cameras]
+    near_cameras = [run.scene.frame.near_camera(camera) for camera in cameras]
     rows = []
     with run.progress.track("score", len(methods)) as advance:
         for name in methods:
-            shared = (reference.frames, exposure, perceptual, cameras, positions)
+            shared = (reference.frames, exposure, perceptual, near_cameras, positions)
             rows.append(_row(name, frames[name], *shared, milliseconds[name]))
             advance(note=name)
     coverage = float(np.mean([renderer.render(camera).coverage for camera in cameras]))

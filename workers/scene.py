@@ -34,6 +34,7 @@ from workers.scene_nodes import (
 )
 from workers.scene_xml import read_xml
 from workers.scene_yaml import YAML_SUFFIXES, read_yaml
+from workers.world_frame import OWN, WorldFrame, dim_lights, move_nodes
 
 DIGEST_VERSION = 1
 
@@ -56,6 +57,7 @@ class Scene:
         notes: what was added, changed or ignored, one line each.
         settings: overrides of the run's settings that the scene file asks for.
         source: what `load_scene` was given.
+        frame: where `mi_scene` lies; cameras, bounds and clip distances here are in the file's own frame.
     """
 
     name: str
@@ -70,16 +72,17 @@ class Scene:
     notes: tuple[str, ...] = ()
     settings: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     source: str
+    frame: WorldFrame = OWN
 
     @property
     def bounds_centre(self) -> np.ndarray:
         """[3] centre of the bounding box, scene units."""
-        return bounds(self.mi_scene)[0]
+        return self.frame.file_points(bounds(self.mi_scene)[0])
 
     @property
     def bounds_diagonal(self) -> float:
         """Diagonal of the bounding box, scene units."""
-        return bounds(self.mi_scene)[1]
+        return bounds(self.mi_scene)[1] / self.frame.scale
 
     def make_sensor(self, camera: Camera, spp: int = 1) -> Any:
         """`mi.Sensor` for a camera: float32 RGB film, box filter, independent sampler.
@@ -90,11 +93,11 @@ class Scene:
         return mi.load_dict(
             {
                 "type": "perspective",
-                "to_world": mi.ScalarTransform4f(camera.to_world.tolist()),
+                "to_world": mi.ScalarTransform4f(self.frame.local_camera(camera).to_world.tolist()),
                 "fov": camera.fov_deg,
                 "fov_axis": "x",
-                "near_clip": self.near_clip,
-                "far_clip": self.far_clip,
+                "near_clip": self.near_clip * self.frame.scale,
+                "far_clip": self.far_clip * self.frame.scale,
                 "sampler": {"type": "independent", "sample_count": int(spp)},
                 "film": {
                     "type": "hdrfilm",
@@ -143,17 +146,19 @@ def load_scene(source: str | Path, *, width: int | None = None, height: int | No
         clips = [_float_property(sensor, key) for key in ("near_clip", "far_clip")]
     else:
         clips = [None, None]
-    mi_scene = instantiate(draft.state, draft.what)
+    mi_scene, frame = _built(draft)
     draft.notes += check_scene(mi_scene, draft.what)
+    if not frame.is_own:
+        draft.notes.append(frame.describe())
     if pose is not None:
         camera = Camera(pose, horizontal_fov_deg(sensor, *pixels, draft.what), *pixels)
     else:
         assert draft.make_camera is not None
         camera = draft.make_camera(*pixels)
-    near, far = _clip_distances(mi_scene, camera, clips[0], clips[1])
+    near, far = _clip_distances(mi_scene, frame, camera, clips[0], clips[1])
     return Scene(
         name=name,
-        digest=_digest(draft, depth if depth != file_depth else None),
+        digest=_digest(draft, frame, depth if depth != file_depth else None),
         mi_scene=mi_scene,
         camera=camera,
         keyframes=draft.make_keyframes(camera) if draft.make_keyframes else (),
@@ -164,6 +169,7 @@ def load_scene(source: str | Path, *, width: int | None = None, height: int | No
         notes=tuple(draft.notes),
         settings=MappingProxyType(draft.settings),
         source=str(source),
+        frame=frame,
     )
 
 
@@ -198,8 +204,25 @@ def _slug(text: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-") or "scene"
 
 
-def _digest(draft: SceneDraft, asked_depth: int | None) -> str:
-    content = {"version": DIGEST_VERSION, "content": draft.content, "max_depth": asked_depth}
+def _built(draft: SceneDraft) -> tuple[Any, WorldFrame]:
+    """Mitsuba's scene and the frame it lies in; a scene that its own frame does not suit is built twice."""
+    mi_scene = instantiate(draft.state, draft.what)
+    if draft.frame is not None:
+        return mi_scene, draft.frame
+    box = mi_scene.bbox()
+    frame = WorldFrame.of_box(np.array(box.min).ravel(), np.array(box.max).ravel())
+    if frame.is_own:
+        return mi_scene, frame
+    move_nodes(draft.state, frame)
+    mi_scene = instantiate(draft.state, draft.what)
+    dim_lights(mi_scene, frame)
+    return mi_scene, frame
+
+
+def _digest(draft: SceneDraft, frame: WorldFrame, asked_depth: int | None) -> str:
+    content: dict[str, Any] = {"version": DIGEST_VERSION, "content": draft.content, "max_depth": asked_depth}
+    if not frame.is_own:
+        content["frame"] = [*frame.origin, frame.scale]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
@@ -213,8 +236,10 @@ def _float_property(node: Any, key: str) -> float | None:
     return float(node.props[key]) if key in node.props else None
 
 
-def _clip_distances(scene: Any, camera: Camera, near: float | None, far: float | None) -> tuple[float, float]:
+def _clip_distances(
+    scene: Any, frame: WorldFrame, camera: Camera, near: float | None, far: float | None
+) -> tuple[float, float]:
     """The file's own clip distances, else ones that cut nothing that can be seen."""
     centre, diagonal = bounds(scene)
-    reach = diagonal + float(np.linalg.norm(camera.origin - centre))
+    reach = diagonal / frame.scale + float(np.linalg.norm(camera.origin - frame.file_points(centre)))
     return (1e-4 * reach if near is None else near), (100.0 * reach if far is None else far)

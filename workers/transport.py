@@ -43,8 +43,8 @@ class PathStart:
 
 def power_heuristic(pdf_a: "mi.Float", pdf_b: "mi.Float") -> "mi.Float":
     """Weight of the technique with density `pdf_a` against the one with `pdf_b` (beta = 2)."""
-    a2, b2 = dr.square(pdf_a), dr.square(pdf_b)
-    return dr.select(pdf_a > 0, a2 / (a2 + b2), 0.0)
+    # By their ratio: the squares of a tiny light's density overflow, those of a huge light's underflow to 0 / 0.
+    return dr.select(pdf_a > 0, dr.rcp(1 + dr.square(pdf_b / pdf_a)), 0.0)
 
 
 @dr.syntax
