@@ -66,8 +66,9 @@ def tone_map(radiance: Image, exposure: float) -> NDArray[np.float32]:
 
     NaN stays NaN.
     """
-    exposed = np.ascontiguousarray(radiance, dtype=np.float32) * np.float32(exposure)
-    return srgb_forward(torch.from_numpy(exposed)).numpy()
+    # Torch multiplies: an overflow is white, nothing to warn of.
+    exposed = torch.from_numpy(np.ascontiguousarray(radiance, dtype=np.float32)) * exposure
+    return srgb_forward(exposed).numpy()
 
 
 def psnr(display: Image, reference: Image) -> float:
@@ -222,7 +223,7 @@ def score_frame(frame: Image, reference: Image, exposure: float, perceptual: Per
         MetricError: The reference holds a non-finite value: nothing can be scored against it.
         ShapeError: Shapes differ or are too small.
     """
-    _check_pair(frame, reference)
+    _check_shapes(frame, reference)
     if not np.isfinite(reference).all():
         raise MetricError("a reference must be finite, got NaN or Inf; render it again")
     non_finite = int(frame.size - np.count_nonzero(np.isfinite(frame)))
@@ -247,6 +248,16 @@ def _decibels(mean_square: float) -> float:
 
 
 def _check_pair(image: Image, reference: Image, *, min_size_px: int = 1) -> None:
+    """Metrics absorb non-finite values silently, each in its own way: they are refused before."""
+    _check_shapes(image, reference, min_size_px=min_size_px)
+    bad = [values.size - int(np.count_nonzero(np.isfinite(values))) for values in (image, reference)]
+    if any(bad):
+        raise MetricError(
+            f"images must be finite, got {bad[0]} and {bad[1]} of {image.size} values NaN or Inf; use score_frame"
+        )
+
+
+def _check_shapes(image: Image, reference: Image, *, min_size_px: int = 1) -> None:
     shape = image.shape
     if shape != reference.shape or len(shape) != 3 or shape[2] != 3 or min(shape[:2]) < min_size_px:
         raise ShapeError(f"images must both be HxWx3 with H, W >= {min_size_px}, got {shape} and {reference.shape}")

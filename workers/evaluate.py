@@ -142,8 +142,13 @@ def _methods(run: RunState, renderer: FrameRenderer) -> dict[str, Method]:
         parts = [features[..., slice(*CHANNELS[name])] for name in ("ir", "albedo", "normal")]
         return denoise(*parts, quality="high", clean_features=True)
 
+    def ours(camera: Camera, index: int) -> np.ndarray:
+        del index
+        frame = renderer.render(camera)
+        return renderer.unchecked(camera) if frame.non_finite else frame.radiance
+
     methods: dict[str, Method] = {
-        "ours": lambda camera, index: renderer.render(camera).radiance,
+        "ours": ours,
         "ir": ir,
         "ir+oidn": ir_denoised,
     }

@@ -43,13 +43,18 @@ class WorldFrame:
     def of_box(cls, low: ArrayLike, high: ArrayLike) -> "WorldFrame":
         """The frame that suits a bounding box: the file's own wherever that is precise enough."""
         low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
-        if not (np.isfinite(low).all() and np.isfinite(high).all() and (high > low).any()):
+        if not (np.isfinite(low).all() and np.isfinite(high).all()):
             return OWN
         diagonal, centre = float(np.linalg.norm(high - low)), (low + high) / 2
-        scale = 2.0 ** np.ceil(-np.log2(diagonal)) if diagonal < SMALLEST_DIAGONAL else 1.0
+        scale = 2.0 ** np.ceil(-np.log2(diagonal)) if 0.0 < diagonal < SMALLEST_DIAGONAL else 1.0
         is_far = np.abs(centre).max() > FARTHEST_DIAGONALS * max(diagonal, SMALLEST_DIAGONAL / scale)
         x, y, z = (float(value) for value in (centre if is_far else np.zeros(3)))
         return cls((x, y, z), float(scale))
+
+    def then(self, further: "WorldFrame") -> "WorldFrame":
+        """This frame, then another that is stated in this one's local units."""
+        x, y, z = (float(value) for value in self.file_points(further.origin))
+        return WorldFrame((x, y, z), self.scale * further.scale)
 
     @property
     def is_own(self) -> bool:
@@ -99,6 +104,12 @@ class WorldFrame:
 OWN = WorldFrame()
 
 
+def suitable_frame(mi_scene: Any) -> WorldFrame:
+    """The frame that suits a built scene."""
+    box = mi_scene.bbox()
+    return WorldFrame.of_box(np.array(box.min).ravel(), np.array(box.max).ravel())
+
+
 def move_nodes(state: Any, frame: WorldFrame) -> None:
     """Writes a frame into the shapes and lights of a parsed scene, in double precision."""
     for node in nodes_of(state, mi.ObjectType.Shape):
@@ -136,7 +147,7 @@ def _move_shape(props: Any, frame: WorldFrame) -> None:
         to_world = to_world @ ball
         for name in ("center", "radius"):
             if name in props:
-                props.remove_property(name)
+                del props[name]
     props["to_world"] = mi.ScalarTransform4d((frame.matrix @ to_world).tolist())
 
 
