@@ -56,6 +56,8 @@ def _vector(name: str, value: ArrayLike) -> NDArray[np.float64]:
         vector = np.empty(0)
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise CameraError(f"camera {name} must be three finite numbers, got {value!r}")
+    if np.abs(vector).max() > MAX_COORDINATE:
+        raise CameraError(f"camera {name} must be within {MAX_COORDINATE:g} (single precision), got {value!r}")
     return vector
 
 
