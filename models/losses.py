@@ -134,7 +134,7 @@ def multi_scale_gradient_l1(
     Each scale halves the one before by 2x2 means.
 
     Args:
-        prediction: B,C,H,W with H, W >= 2**num_scales.
+        prediction: B,C,H,W; scales too small to have differences (below 2 pixels) are left out.
         target: As prediction.
         num_scales: Number of scales, the full one included.
 
@@ -143,9 +143,13 @@ def multi_scale_gradient_l1(
     """
     # Every step below is linear: one pass over the difference does for both images.
     difference = prediction - target
-    total = difference.new_zeros(())
+    total, num_terms = difference.new_zeros(()), 0
     for scale in range(num_scales):
+        if scale > 0 and min(difference.shape[-2:]) < 2:
+            break
         if scale > 0:
             difference = F.avg_pool2d(difference, 2)
-        total = total + difference.diff(dim=-1).abs().mean() + difference.diff(dim=-2).abs().mean()
-    return total / (2 * num_scales)
+        for axis in (-1, -2):
+            if difference.shape[axis] > 1:  # the mean of no differences is NaN
+                total, num_terms = total + difference.diff(dim=axis).abs().mean(), num_terms + 1
+    return total / max(num_terms, 1)

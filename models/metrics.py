@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from skimage.metrics import structural_similarity
 
 from models.errors import MetricError, ShapeError
+from models.perceptual import MIN_SIZE_PX as MIN_PERCEPTUAL_PX
 from models.transfer import srgb_forward
 
 Image = NDArray[np.floating]
@@ -27,6 +28,7 @@ EXPOSED_P80 = 0.6
 """The exposure puts the 80th percentile of luminance here."""
 RELATIVE_EPSILON = 1e-2
 """Keeps relMSE and SMAPE finite in the dark; in exposed radiance, where 1 is display white."""
+MIN_SSIM_PX = 11
 PSNR_LIMIT_DB = 100.0
 """PSNR of identical images, for which the formula says infinity, which JSON cannot hold."""
 LUMINANCE_REC709 = np.array((0.2126, 0.7152, 0.0722), dtype=np.float32)
@@ -66,8 +68,9 @@ def tone_map(radiance: Image, exposure: float) -> NDArray[np.float32]:
 
     NaN stays NaN.
     """
-    exposed = np.ascontiguousarray(radiance, dtype=np.float32) * np.float32(exposure)
-    return srgb_forward(torch.from_numpy(exposed)).numpy()
+    # Torch multiplies: an overflow is white, nothing to warn of.
+    exposed = torch.from_numpy(np.ascontiguousarray(radiance, dtype=np.float32)) * exposure
+    return srgb_forward(exposed).numpy()
 
 
 def psnr(display: Image, reference: Image) -> float:
@@ -81,7 +84,7 @@ def ssim(display: Image, reference: Image) -> float:
 
     H and W must be at least 11. 1 is identical.
     """
-    _check_pair(display, reference, min_size_px=11)
+    _check_pair(display, reference, min_size_px=MIN_SSIM_PX)
     score = structural_similarity(
         display.astype(np.float64), reference.astype(np.float64), data_range=1.0, channel_axis=2,
         gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
@@ -182,7 +185,8 @@ def reference_error_db(reference: Image, standard_error: Image, exposure: float)
 class Scores:
     """Scores of one frame against its reference.
 
-    All but `non_finite` are None when the frame holds a non-finite value.
+    All but `non_finite` are None when the frame holds a non-finite value; `ssim` and `st_lpips` are None too where it
+    is smaller than their windows.
 
     Attributes:
         psnr: dB, higher is better.
@@ -213,16 +217,16 @@ def score_frame(frame: Image, reference: Image, exposure: float, perceptual: Per
     Metrics absorb such values silently: FLIP takes NaN for black.
 
     Args:
-        frame: HxWx3 linear radiance, H, W >= 11 (>= 32 with a perceptual network).
+        frame: HxWx3 linear radiance.
         reference: As frame.
         exposure: The scene's exposure.
         perceptual: `models.perceptual.StLpips`, or None to leave that score out.
 
     Raises:
         MetricError: The reference holds a non-finite value: nothing can be scored against it.
-        ShapeError: Shapes differ or are too small.
+        ShapeError: Shapes differ.
     """
-    _check_pair(frame, reference)
+    _check_shapes(frame, reference)
     if not np.isfinite(reference).all():
         raise MetricError("a reference must be finite, got NaN or Inf; render it again")
     non_finite = int(frame.size - np.count_nonzero(np.isfinite(frame)))
@@ -230,11 +234,12 @@ def score_frame(frame: Image, reference: Image, exposure: float, perceptual: Per
         return Scores(non_finite=non_finite)
     display, target = tone_map(frame, exposure), tone_map(reference, exposure)
     x, y = (image.astype(np.float64) * exposure for image in (frame, reference))
+    smallest = min(frame.shape[:2])
     return Scores(
         psnr=psnr(display, target),
-        ssim=ssim(display, target),
+        ssim=ssim(display, target) if smallest >= MIN_SSIM_PX else None,
         flip=flip(display, target)[0],
-        st_lpips=None if perceptual is None else st_lpips(display, target, perceptual),
+        st_lpips=None if perceptual is None or smallest < MIN_PERCEPTUAL_PX else st_lpips(display, target, perceptual),
         relmse=relmse(x, y),
         smape=smape(x, y),
     )
@@ -247,6 +252,16 @@ def _decibels(mean_square: float) -> float:
 
 
 def _check_pair(image: Image, reference: Image, *, min_size_px: int = 1) -> None:
+    """Metrics absorb non-finite values silently, each in its own way: they are refused before."""
+    _check_shapes(image, reference, min_size_px=min_size_px)
+    bad = [values.size - int(np.count_nonzero(np.isfinite(values))) for values in (image, reference)]
+    if any(bad):
+        raise MetricError(
+            f"images must be finite, got {bad[0]} and {bad[1]} of {image.size} values NaN or Inf; use score_frame"
+        )
+
+
+def _check_shapes(image: Image, reference: Image, *, min_size_px: int = 1) -> None:
     shape = image.shape
     if shape != reference.shape or len(shape) != 3 or shape[2] != 3 or min(shape[:2]) < min_size_px:
         raise ShapeError(f"images must both be HxWx3 with H, W >= {min_size_px}, got {shape} and {reference.shape}")

@@ -20,6 +20,7 @@ from workers.errors import WorkerError
 from workers.lobes import reflectance_at
 from workers.query import CacheArrays
 from workers.run_state import RunState
+from workers.transport import TRANSPORT_VERSION
 
 STAGE = "bake"
 LANES_PER_LAUNCH = 1 << 21
@@ -43,7 +44,7 @@ def _lobes(run: RunState, elements: ElementSet) -> list[_Lobe]:
     cache = run.settings.cache
     scene, table, depth = run.scene.mi_scene, run.table, run.scene.max_depth
     common = {"elements": elements_ref(run).key, "max_depth": depth, "passes": cache.passes,
-              "elements_per_unit": cache.elements_per_unit}  # fmt: skip
+              "elements_per_unit": cache.elements_per_unit, "transport": TRANSPORT_VERSION}  # fmt: skip
     grid = (cache.azimuth, cache.polar)
     diffuse_spp = _per_pass(cache.diffuse_spp, cache.passes)
     directional_spp = _per_pass(cache.directional_spp, cache.passes)
@@ -166,8 +167,8 @@ def load_caches(run: RunState, elements: ElementSet) -> CacheArrays:
     if cache.denoise and not exitant:
         directional = filter_directional(elements, directional)
         if "diffuse" in loaded:
-            square = loaded["diffuse"]["square"]
-            variance = np.maximum(square - diffuse**2, 0.0) / max(cache.diffuse_spp - 1, 1)
+            square = loaded["diffuse"]["square"].astype(np.float64)
+            variance = np.maximum(square - diffuse.astype(np.float64) ** 2, 0.0) / max(cache.diffuse_spp - 1, 1)
             diffuse = filter_diffuse(elements, diffuse, np.sqrt(variance))
     if not cache.demodulate and not exitant:
         diffuse = diffuse * reflectance_at(run.table, elements)

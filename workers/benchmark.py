@@ -106,13 +106,14 @@ def frame_times(
         Denoise alone, with albedo and normal); "ratios" of them; "network" as `network_rate` returns it.
     """
     camera = scene.camera.resized(width, height)
+    local = renderer.program.table.frame.local_camera(camera)
     primary = PrimaryRays(renderer.program.scene)
     features = renderer.program.run(camera)
     traced = trace(scene, camera, 1, _SEED, features=True)
     # Only its time counts here: a stray Inf must not stop a benchmark.
     noisy = np.where(np.isfinite(traced.radiance), traced.radiance, 0.0).astype(np.float32)
     methods: dict[str, Callable[[int], object]] = {
-        "primary": lambda index: primary.cast(camera),
+        "primary": lambda index: primary.cast(local),
         "query-1x1": lambda index: single.run(camera),
         "query": lambda index: renderer.program.run(camera),
         "network": lambda index: renderer.reconstructor(features),

@@ -12,13 +12,16 @@ from scipy.spatial import cKDTree
 from workers.elements import ElementSet
 
 # Part of the keys of what is made from filtered caches; raise it whenever the filter's result changes.
-FILTER_VERSION = 2
+FILTER_VERSION = 3
 NUM_NEIGHBOURS = 24
 PASSES = 2
 NORMAL_POWER = 16
 RANGE_STRENGTH = 4.0
 SIGMA_SPACINGS = 1.6
 SIGMA_SPACINGS_DIRECTIONAL = 1.0
+# Differences below this share of the values are no edge, whatever the measured variance says.
+FLOOR_SHARE = 1e-6
+TINY = np.finfo(np.float64).tiny
 # A neighbour further than this many median spacings is no neighbour.
 MAX_SPACINGS = 3.0
 
@@ -54,7 +57,9 @@ def _filter_once(
     pooled = np.sum(weight * variance[index], axis=1) / np.sum(weight, axis=1)
     difference = np.mean((values[index] - values[:, None]) ** 2, axis=2)
     noise = pooled[index] + pooled[:, None]
-    total = weight * np.exp(-np.maximum(difference - noise, 0.0) / (RANGE_STRENGTH * noise + 1e-12))
+    # Relative: an absolute floor would swallow the edges of a scene lit by 1e-8.
+    floor = FLOOR_SHARE**2 * np.mean(values[index] ** 2 + values[:, None] ** 2, axis=2) + TINY
+    total = weight * np.exp(-np.maximum(difference - noise, 0.0) / (RANGE_STRENGTH * noise + floor))
     total /= total.sum(axis=1, keepdims=True)
     return np.einsum("nk,nkc->nc", total, values[index]), np.sum(total**2 * variance[index], axis=1)
 

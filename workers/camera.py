@@ -17,6 +17,7 @@ from workers.errors import CameraError
 
 BYTES_PER_PIXEL = 200  # wavefront state and G-buffer of one primary ray, roughly
 _CHECK_MEMORY_ABOVE_PX = 4_000_000
+MAX_COORDINATE = 1e18  # scene units; squares still fit single precision
 _ORTHONORMAL_TOLERANCE = 1e-3
 
 
@@ -55,6 +56,8 @@ def _vector(name: str, value: ArrayLike) -> NDArray[np.float64]:
         vector = np.empty(0)
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise CameraError(f"camera {name} must be three finite numbers, got {value!r}")
+    if np.abs(vector).max() > MAX_COORDINATE:
+        raise CameraError(f"camera {name} must be within {MAX_COORDINATE:g} (single precision), got {value!r}")
     return vector
 
 
@@ -86,6 +89,10 @@ class Camera:
             raise CameraError(f"camera to_world must be 4x4 finite numbers, got {self.to_world!r}")
         if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-9):
             raise CameraError(f"camera to_world must end in the row 0 0 0 1, got {matrix[3].tolist()}")
+        if np.abs(matrix[:3, 3]).max() > MAX_COORDINATE:
+            raise CameraError(
+                f"camera origin must be within {MAX_COORDINATE:g} (single precision), got {matrix[:3, 3].tolist()}"
+            )
         rotation = matrix[:3, :3]
         if not np.allclose(rotation.T @ rotation, np.eye(3), atol=_ORTHONORMAL_TOLERANCE):
             raise CameraError(

@@ -18,9 +18,10 @@ def hit_distances(scene: Scene, origins: Floats, directions: Floats) -> Floats:
     vectors."""
     if len(origins) == 0:
         return np.empty(0)
-    ray = mi.Ray3f(mi.Point3f(origins.T.astype(np.float32)), mi.Vector3f(directions.T.astype(np.float32)))
+    local = scene.frame.local_points(origins)
+    ray = mi.Ray3f(mi.Point3f(local.T.astype(np.float32)), mi.Vector3f(directions.T.astype(np.float32)))
     distances = np.array(scene.mi_scene.ray_intersect_preliminary(ray).t, dtype=np.float64)
-    return np.where(np.isfinite(distances) & (distances < 1e30), distances, np.inf)
+    return np.where(np.isfinite(distances) & (distances < 1e30), distances / scene.frame.scale, np.inf)
 
 
 def clearance(scene: Scene, origins: Floats) -> Floats:

@@ -228,6 +228,8 @@ def surface_frame(
     table: SurfaceTable, shape: np.ndarray, prim_local: np.ndarray, uv: np.ndarray, side: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Position, shading normal and geometric normal (both towards `side`) of places; float32 [n, 3] each."""
+    if len(shape) == 0:  # Dr.Jit cannot evaluate nothing
+        return tuple(np.zeros((0, 3), np.float32) for _ in range(3))  # type: ignore[return-value]
     si = table.interaction(shape, prim_local, uv)
     sign = np.where(side == 1, -1.0, 1.0).astype(np.float32)[:, None]
     dr.eval(si.p, si.sh_frame.n, si.n)

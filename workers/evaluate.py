@@ -82,10 +82,11 @@ def run_evaluation(
                 advance(note=name)
     milliseconds = _interleaved_times(run, methods)
     positions = [_positions(renderer, camera) for camera in cameras]
+    near_cameras = [run.scene.frame.near_camera(camera) for camera in cameras]
     rows = []
     with run.progress.track("score", len(methods)) as advance:
         for name in methods:
-            shared = (reference.frames, exposure, perceptual, cameras, positions)
+            shared = (reference.frames, exposure, perceptual, near_cameras, positions)
             rows.append(_row(name, frames[name], *shared, milliseconds[name]))
             advance(note=name)
     coverage = float(np.mean([renderer.render(camera).coverage for camera in cameras]))
@@ -141,8 +142,13 @@ def _methods(run: RunState, renderer: FrameRenderer) -> dict[str, Method]:
         parts = [features[..., slice(*CHANNELS[name])] for name in ("ir", "albedo", "normal")]
         return denoise(*parts, quality="high", clean_features=True)
 
+    def ours(camera: Camera, index: int) -> np.ndarray:
+        del index
+        frame = renderer.render(camera)
+        return renderer.unchecked(camera) if frame.non_finite else frame.radiance
+
     methods: dict[str, Method] = {
-        "ours": lambda camera, index: renderer.render(camera).radiance,
+        "ours": ours,
         "ir": ir,
         "ir+oidn": ir_denoised,
     }

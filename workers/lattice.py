@@ -48,7 +48,7 @@ class PatchTable:
 
 def patch_counts(prim_edge: np.ndarray, prim_footprint: np.ndarray) -> np.ndarray:
     """m of each primitive: patches of about `PATCH_FOOTPRINTS` pixels; 1 where it is never seen (footprint inf)."""
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # a camera on a surface has a footprint of 0
         wanted = np.ceil(prim_edge / (PATCH_FOOTPRINTS * prim_footprint))
     return np.clip(np.nan_to_num(wanted, nan=1.0), 1, MAX_PATCHES).astype(np.uint32)
 
@@ -72,7 +72,7 @@ def tessellation_counts(prim_edge: np.ndarray, diagonal: float, max_edge_fractio
 
 def patch_levels(edge: np.ndarray, footprint: np.ndarray, spacing_px: float) -> np.ndarray:
     """n of each patch: points `spacing_px` footprints apart, at least the corners; 0 where it is never seen."""
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         wanted = np.ceil(edge / (spacing_px * footprint))
     seen = np.isfinite(footprint)
     return np.where(seen, np.clip(np.nan_to_num(wanted, nan=0.0), 1, MAX_LEVEL), 0).astype(np.uint32)

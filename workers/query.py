@@ -76,10 +76,10 @@ class QueryProgram:
             float32 [height, width, NUM_CHANNELS]; channels by `CHANNELS`. IR in linear scene radiance,
             normals unit and towards the viewer (0 on a miss), albedo in [0, 1], distance in scene units (0
             on a miss), coverage the share of radiance lookups answered by baked elements, position the first
-            sample's hit in world space (NaN on a miss).
+            sample's hit in scene units from `WorldFrame.origin` (NaN on a miss).
         """
         width, height = camera.width, camera.height
-        device = DeviceCamera.upload(camera)
+        device = DeviceCamera.upload(self.table.frame.local_camera(camera))
         with _no_collection():
             try:
                 outputs = self._replay(device, width, height)
@@ -129,7 +129,9 @@ class QueryProgram:
     def _store(self, pixel, walk: _Walk) -> "mi.Float":
         buffer = dr.empty(mi.Float, dr.width(pixel) * NUM_CHANNELS)
         coverage = dr.select(walk.asked > 0, walk.covered / walk.asked, 1.0)
-        values = [*walk.radiance, *walk.normal, *walk.albedo, walk.distance, coverage, *walk.position]
+        unit = 1.0 / self.table.frame.scale  # scene units
+        place = (walk.distance * unit, coverage, *(walk.position * unit))
+        values = [*walk.radiance, *walk.normal, *walk.albedo, *place]
         values += [mi.Float(0)] * (NUM_CHANNELS - len(values))
         dr.scatter(buffer, mi.ArrayXf(values), pixel)
         return buffer
@@ -244,9 +246,10 @@ class QueryProgram:
         centre = mi.Point3f(xyz(dr.gather(mi.Vector4f, self.shading.glossy_position, slot, hit)))
         normal = xyz(dr.gather(mi.Vector4f, self.shading.glossy_normal, slot, hit))
         facing = dr.sign(-dr.dot(si.n, ray.d))
-        distance = dr.norm(centre - si.p)
+        distance = dr.norm(centre - si.p) / self.table.frame.scale
         if self.settings.scale_free:
-            distance /= dr.maximum(dr.sqrt(dr.norm(dr.cross(si.dp_du, si.dp_dv))), 1e-8)
+            size = dr.sqrt(dr.norm(dr.cross(si.dp_du, si.dp_dv))) / self.table.frame.scale
+            distance /= dr.maximum(size, dr.smallest(mi.Float))
         cosine = dr.maximum(dr.dot(normal, si.sh_frame.n * facing), 0.0)
         return dr.select(hit, dr.exp(-distance) * cosine, 0.0) + PAPER_DELTA
 

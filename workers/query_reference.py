@@ -251,9 +251,10 @@ class _Query:
         points, _ = self.lattice_points(hits)
         slots = self.elements.glossy_slot[points[:, 0]]
         element = self.elements.glossy[np.where(hits.valid, slots & (NOT_BAKED - np.uint32(1)), 0)]
-        distance = np.linalg.norm(self.elements.position[element] - hits.position, axis=1)
+        unit = 1.0 / self.table.frame.scale
+        distance = np.linalg.norm(self.elements.position[element] - hits.position, axis=1) * unit
         if self.settings.scale_free:
-            distance = distance / np.maximum(hits.prim_size, 1e-8)
+            distance = distance / np.maximum(hits.prim_size * unit, 1e-38)
         cosine = (self.elements.normal[element] * hits.normal * hits.facing[:, None]).sum(1)
         return np.where(hits.valid, np.exp(-distance) * np.maximum(cosine, 0), 0.0) + PAPER_DELTA
 
@@ -276,6 +277,7 @@ def query_reference(
         float64 [height, width, channels] by the names of `workers.query.CHANNELS`, with the same meaning.
     """
     query = _Query(mi_scene, table, elements, caches, settings)
+    camera, unit = table.frame.local_camera(camera), 1.0 / table.frame.scale
     y, x = (axis.reshape(-1) for axis in np.mgrid[: camera.height, : camera.width])
     if settings.weights == "barycentric":
         n = settings.samples
@@ -293,7 +295,8 @@ def query_reference(
     with np.errstate(invalid="ignore"):
         coverage = np.where(asked > 0, baked / asked, 1.0)[:, None]
     image = {name: np.mean([walk[name] for walk in walks], axis=0) for name in ("normal", "albedo", "distance")}
-    image |= {"ir": radiance, "coverage": coverage, "position": walks[0]["position"]}
+    image["distance"] = image["distance"] * unit
+    image |= {"ir": radiance, "coverage": coverage, "position": walks[0]["position"] * unit}
     return {name: value.reshape(camera.height, camera.width, -1) for name, value in image.items()}
 
 

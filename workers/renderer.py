@@ -30,7 +30,8 @@ class Frame:
         seconds: wall seconds of "query" and "network".
         coverage: share of radiance lookups answered by baked elements, in [0, 1].
         exposure: the scene's exposure, to show the frame.
-        non_finite: values that are NaN or infinite (reported, never hidden).
+        non_finite: values that came NaN or infinite out of the query or the network. They are counted, reported and not
+            in `radiance`: the network sees 0 for them, the frame shows the caches' own radiance there.
     """
 
     radiance: np.ndarray
@@ -80,8 +81,10 @@ class FrameRenderer:
         start = time.perf_counter()
         features = self.program.run(camera)
         queried = time.perf_counter()
+        bad_inputs = _finite_in_place(features[..., : CHANNELS["position"][0]], 0.0)
         with pool_at_rest():
             radiance = self.reconstructor(features)
+        bad_outputs = _finite_in_place(radiance, features[..., slice(*CHANNELS["ir"])])
         finished = time.perf_counter()
         a, b = CHANNELS["coverage"]
         return Frame(
@@ -89,8 +92,21 @@ class FrameRenderer:
             seconds={"query": queried - start, "network": finished - queried},
             coverage=float(np.mean(features[..., a:b])),
             exposure=self.reconstructor.encoding.exposure,
-            non_finite=int(radiance.size - np.isfinite(radiance).sum()),
+            non_finite=bad_inputs + bad_outputs,
         )
+
+    def unchecked(self, camera: Camera) -> np.ndarray:
+        """Radiance as the network gives it, NaN and Inf included: for scores, which must refuse them."""
+        return self.reconstructor(self.program.run(camera))
+
+
+def _finite_in_place(values: np.ndarray, instead: np.ndarray | float) -> int:
+    """Replaces NaN and Inf and returns how many there were."""
+    finite = np.isfinite(values)
+    if finite.all():
+        return 0
+    np.copyto(values, instead, where=~finite)
+    return int(values.size - np.count_nonzero(finite))
 
 
 def publish(run: RunState, network_ref: UnitRef, psnr: float | None) -> None:

@@ -38,7 +38,7 @@ class RunState:
 
     @cached_property
     def table(self) -> SurfaceTable:
-        return build_surface_table(self.scene.mi_scene)
+        return build_surface_table(self.scene.mi_scene, self.scene.frame)
 
     @cached_property
     def paths(self) -> CameraPaths:

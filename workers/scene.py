@@ -7,7 +7,7 @@ load_scene("scene.xml") | load_scene("scene.yaml") | load_scene("chair.glb") | l
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -34,8 +34,10 @@ from workers.scene_nodes import (
 )
 from workers.scene_xml import read_xml
 from workers.scene_yaml import YAML_SUFFIXES, read_yaml
+from workers.world_frame import OWN, WorldFrame, dim_lights, move_nodes, suitable_frame
 
 DIGEST_VERSION = 1
+MAX_MOVES = 3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -56,6 +58,7 @@ class Scene:
         notes: what was added, changed or ignored, one line each.
         settings: overrides of the run's settings that the scene file asks for.
         source: what `load_scene` was given.
+        frame: where `mi_scene` lies; cameras, bounds and clip distances here are in the file's own frame.
     """
 
     name: str
@@ -70,16 +73,17 @@ class Scene:
     notes: tuple[str, ...] = ()
     settings: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     source: str
+    frame: WorldFrame = OWN
 
     @property
     def bounds_centre(self) -> np.ndarray:
         """[3] centre of the bounding box, scene units."""
-        return bounds(self.mi_scene)[0]
+        return self.frame.file_points(bounds(self.mi_scene)[0])
 
     @property
     def bounds_diagonal(self) -> float:
         """Diagonal of the bounding box, scene units."""
-        return bounds(self.mi_scene)[1]
+        return bounds(self.mi_scene)[1] / self.frame.scale
 
     def make_sensor(self, camera: Camera, spp: int = 1) -> Any:
         """`mi.Sensor` for a camera: float32 RGB film, box filter, independent sampler.
@@ -90,11 +94,11 @@ class Scene:
         return mi.load_dict(
             {
                 "type": "perspective",
-                "to_world": mi.ScalarTransform4f(camera.to_world.tolist()),
+                "to_world": mi.ScalarTransform4f(self.frame.local_camera(camera).to_world.tolist()),
                 "fov": camera.fov_deg,
                 "fov_axis": "x",
-                "near_clip": self.near_clip,
-                "far_clip": self.far_clip,
+                "near_clip": self.near_clip * self.frame.scale,
+                "far_clip": self.far_clip * self.frame.scale,
                 "sampler": {"type": "independent", "sample_count": int(spp)},
                 "film": {
                     "type": "hdrfilm",
@@ -123,37 +127,26 @@ def load_scene(source: str | Path, *, width: int | None = None, height: int | No
         SceneError: the scene is missing, broken, or asks for what caches cannot represent.
         CameraError: the image size is not usable.
     """
-    name, draft = _read(source)
-    draft.notes += audit_nodes(draft.state, draft.what)
-    name_shapes(draft.state)
-    sensor, sensor_notes = first_sensor(draft.state, draft.what)
-    draft.notes += sensor_notes
-    if sensor is None and draft.make_camera is None:
-        raise SceneError(f'{draft.what} must hold a sensor, got none; add a <sensor type="perspective">')
     for option, size in (("width", width), ("height", height)):
         if size is not None and size < 1:
             raise SceneError(f"image {option} must be at least 1 pixel, got {size}")
-    pixels = set_film_size(draft.state, width, height, draft.what)
+    parsed = _parse(source, width, height)
+    draft, pixels = parsed.draft, parsed.pixels
     file_depth = path_max_depth(draft.state)
     depth = _checked_depth(file_depth if max_depth is None else max_depth)
-    pose = None
-    if sensor is not None:
-        pose, pose_notes = sensor_pose(sensor, draft.what)
-        draft.notes += pose_notes
-        clips = [_float_property(sensor, key) for key in ("near_clip", "far_clip")]
-    else:
-        clips = [None, None]
-    mi_scene = instantiate(draft.state, draft.what)
-    draft.notes += check_scene(mi_scene, draft.what)
-    if pose is not None:
-        camera = Camera(pose, horizontal_fov_deg(sensor, *pixels, draft.what), *pixels)
+    mi_scene, frame = _built(draft, lambda: _parse(source, width, height).draft)
+    notes = [*draft.notes, *check_scene(mi_scene, draft.what)]
+    if not frame.is_own:
+        notes.append(frame.describe())
+    if parsed.pose is not None:
+        camera = Camera(parsed.pose, horizontal_fov_deg(parsed.sensor, *pixels, draft.what), *pixels)
     else:
         assert draft.make_camera is not None
         camera = draft.make_camera(*pixels)
-    near, far = _clip_distances(mi_scene, camera, clips[0], clips[1])
+    near, far = _clip_distances(mi_scene, frame, camera, parsed.sensor)
     return Scene(
-        name=name,
-        digest=_digest(draft, depth if depth != file_depth else None),
+        name=parsed.name,
+        digest=_digest(draft, frame, depth if depth != file_depth else None),
         mi_scene=mi_scene,
         camera=camera,
         keyframes=draft.make_keyframes(camera) if draft.make_keyframes else (),
@@ -161,10 +154,38 @@ def load_scene(source: str | Path, *, width: int | None = None, height: int | No
         max_depth=depth,
         near_clip=near,
         far_clip=far,
-        notes=tuple(draft.notes),
+        notes=tuple(notes),
         settings=MappingProxyType(draft.settings),
         source=str(source),
+        frame=frame,
     )
+
+
+@dataclass(frozen=True)
+class _Parsed:
+    """A scene that is ready to be built: its name, draft, sensor node (None: none), the sensor's pose and pixels."""
+
+    name: str
+    draft: SceneDraft
+    sensor: Any
+    pose: np.ndarray | None
+    pixels: tuple[int, int]
+
+
+def _parse(source: str | Path, width: int | None, height: int | None) -> _Parsed:
+    name, draft = _read(source)
+    draft.notes += audit_nodes(draft.state, draft.what)
+    name_shapes(draft.state)
+    sensor, sensor_notes = first_sensor(draft.state, draft.what)
+    draft.notes += sensor_notes
+    if sensor is None and draft.make_camera is None:
+        raise SceneError(f'{draft.what} must hold a sensor, got none; add a <sensor type="perspective">')
+    pixels = set_film_size(draft.state, width, height, draft.what)
+    pose = None
+    if sensor is not None:
+        pose, pose_notes = sensor_pose(sensor, draft.what)
+        draft.notes += pose_notes
+    return _Parsed(name, draft, sensor, pose, pixels)
 
 
 def _read(source: str | Path) -> tuple[str, SceneDraft]:
@@ -198,8 +219,32 @@ def _slug(text: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-") or "scene"
 
 
-def _digest(draft: SceneDraft, asked_depth: int | None) -> str:
-    content = {"version": DIGEST_VERSION, "content": draft.content, "max_depth": asked_depth}
+def _built(draft: SceneDraft, parse_again: Callable[[], SceneDraft]) -> tuple[Any, WorldFrame]:
+    """Mitsuba's scene and the frame that it lies in.
+
+    A parsed scene can be built only once, so one that its own frame does not suit is parsed again; one both tiny and
+    far away shows its size only when it has been moved.
+    """
+    mi_scene = instantiate(draft.state, draft.what)
+    if draft.frame is not None:
+        return mi_scene, draft.frame
+    frame = OWN
+    for _ in range(MAX_MOVES):
+        further = suitable_frame(mi_scene)
+        if further.is_own:
+            break
+        frame = frame.then(further)
+        moved = parse_again()
+        move_nodes(moved.state, frame)
+        mi_scene = instantiate(moved.state, draft.what)
+        dim_lights(mi_scene, frame)
+    return mi_scene, frame
+
+
+def _digest(draft: SceneDraft, frame: WorldFrame, asked_depth: int | None) -> str:
+    content: dict[str, Any] = {"version": DIGEST_VERSION, "content": draft.content, "max_depth": asked_depth}
+    if not frame.is_own:
+        content["frame"] = [*frame.origin, frame.scale]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
@@ -213,8 +258,9 @@ def _float_property(node: Any, key: str) -> float | None:
     return float(node.props[key]) if key in node.props else None
 
 
-def _clip_distances(scene: Any, camera: Camera, near: float | None, far: float | None) -> tuple[float, float]:
+def _clip_distances(mi_scene: Any, frame: WorldFrame, camera: Camera, sensor: Any) -> tuple[float, float]:
     """The file's own clip distances, else ones that cut nothing that can be seen."""
-    centre, diagonal = bounds(scene)
-    reach = diagonal + float(np.linalg.norm(camera.origin - centre))
+    near, far = (None if sensor is None else _float_property(sensor, key) for key in ("near_clip", "far_clip"))
+    centre, diagonal = bounds(mi_scene)
+    reach = diagonal / frame.scale + float(np.linalg.norm(camera.origin - frame.file_points(centre)))
     return (1e-4 * reach if near is None else near), (100.0 * reach if far is None else far)

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from workers.backend import dr, mi
 from workers.errors import SceneError
 
 
@@ -11,11 +12,13 @@ def check_scene(scene: Any, what: str) -> list[str]:
     """Look at every shape and the lights; returns notes.
 
     Raises:
-        SceneError: no shape, no light, an empty mesh, vertices that are not finite, or a mesh without area.
+        SceneError: no shape, no light, an empty mesh, vertices, textures or other parameters that are not finite, or a
+            mesh without area.
     """
     shapes = scene.shapes()
     if not shapes:
         raise SceneError(f"{what} must hold at least one shape, got none; add geometry")
+    _check_parameters(scene, what)
     degenerate = sum(_check_mesh(shape, what) for shape in shapes if shape.is_mesh())
     if not scene.emitters():
         raise SceneError(f"{what} must hold a light, got none; add an emitter (area, constant, envmap, point, ...)")
@@ -23,6 +26,17 @@ def check_scene(scene: Any, what: str) -> list[str]:
     if degenerate:
         notes.append(f"{degenerate} triangles have no area: nothing is cached on them")
     return notes
+
+
+def _check_parameters(scene: Any, what: str) -> None:
+    """A NaN in one texel becomes a black or burning pixel somewhere else, much later: it is refused here."""
+    for name, value in mi.traverse(scene):
+        if name.endswith("vertex_positions") or not (dr.is_array_v(value) and dr.is_float_v(value)):
+            continue
+        values = np.asarray(np.array(value))
+        bad = int(values.size - np.count_nonzero(np.isfinite(values)))
+        if bad:
+            raise SceneError(f"{what}: {name} must be finite, got {bad} of {values.size} values NaN or Inf; repair it")
 
 
 def _check_mesh(mesh: Any, what: str) -> int:

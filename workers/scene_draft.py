@@ -8,6 +8,7 @@ from typing import Any
 
 from workers.camera import Camera
 from workers.errors import SceneError
+from workers.world_frame import WorldFrame
 
 
 @dataclass(kw_only=True)
@@ -23,6 +24,7 @@ class SceneDraft:
         make_keyframes: builds the keyframes, given the default camera.
         make_test_keyframes: builds the keyframes of the test path, likewise.
         settings: overrides of the run's settings.
+        frame: the frame that the reader built the scene in; None: the file's own, still to be judged.
     """
 
     what: str
@@ -33,6 +35,7 @@ class SceneDraft:
     make_keyframes: Callable[[Camera], tuple[Camera, ...]] | None = None
     make_test_keyframes: Callable[[Camera], tuple[Camera, ...]] | None = None
     settings: dict[str, Any] = field(default_factory=dict)
+    frame: WorldFrame | None = None
 
 
 def file_hash(path: Path) -> str:

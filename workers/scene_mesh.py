@@ -8,6 +8,7 @@ Animation, skinning, morphs, glTF cameras and lights are not read.
 import itertools
 import json
 import struct
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,10 @@ from workers.mesh_building import to_mitsuba
 from workers.mesh_material import read_material
 from workers.scene_draft import SceneDraft, file_hash
 from workers.scene_nodes import first_line, parse_state
+from workers.world_frame import WorldFrame
 
 Floats = NDArray[np.float64]
+Part = Callable[[WorldFrame], Any]
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 FOV_DEG = 45.0
 ENVIRONMENT_RADIANCE = 0.5
@@ -43,8 +46,10 @@ def read_mesh(path: Path) -> SceneDraft:
     files, notes = _referenced_files(path, what)
     content = [(path.suffix.lower(), file_hash(path))]
     content += [(name, file_hash(file)) for name, file in sorted(files.items())]
-    shapes, corners = _shapes(path, what, notes)
-    low, high = corners
+    parts, corners = _parts(path, what, notes)
+    frame = WorldFrame.of_box(*corners)
+    shapes = {name: part(frame) for name, part in parts.items()}
+    low, high = corners = frame.local_points(corners)
     up = np.array([0.0, 0.0, 1.0] if path.suffix.lower() in _Z_UP else [0.0, 1.0, 0.0])
     front = np.array([0.0, -1.0, 0.0] if path.suffix.lower() in _Z_UP else [0.0, 0.0, 1.0])
     centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
@@ -58,7 +63,8 @@ def read_mesh(path: Path) -> SceneDraft:
         state=parse_state(lambda config: mi.parser.parse_dict(config, plugins), what),
         content=content,
         notes=notes,
-        make_camera=lambda width, height: _framing(corners, up, front, width, height),
+        make_camera=lambda width, height: frame.file_camera(_framing(corners, up, front, width, height)),
+        frame=frame,
     )
 
 
@@ -74,13 +80,13 @@ def _framing(corners: Floats, up: Floats, front: Floats, width: int, height: int
     return Camera.look_at(centre - distance * view.forward, centre, up, FOV_DEG, width, height)
 
 
-def _shapes(path: Path, what: str, notes: list[str]) -> tuple[dict[str, Any], Floats]:
-    """({name: built mesh}, [2, 3] bounds); one shape for each node of the file."""
+def _parts(path: Path, what: str, notes: list[str]) -> tuple[dict[str, Part], Floats]:
+    """({name: what builds its mesh in a frame}, [2, 3] bounds); one shape for each node of the file."""
     try:
         loaded = trimesh.load_scene(path, process=False)
     except Exception as error:
         raise SceneError(f"{what} must be a readable {path.suffix} file, got: {first_line(error)}") from error
-    shapes: dict[str, Any] = {}
+    shapes: dict[str, Part] = {}
     corners = np.array([[np.inf] * 3, [-np.inf] * 3])
     skipped = 0
     for node in sorted(loaded.graph.nodes_geometry):
@@ -90,7 +96,7 @@ def _shapes(path: Path, what: str, notes: list[str]) -> tuple[dict[str, Any], Fl
             skipped += 1
             continue
         name = _unused_name(str(node), shapes)
-        shapes[name], positions = _shape(name, geometry, np.asarray(transform), path, what, notes)
+        shapes[name], positions = _part(name, geometry, np.asarray(transform), path, what, notes)
         corners = np.stack([np.minimum(corners[0], positions.min(0)), np.maximum(corners[1], positions.max(0))])
     if not shapes:
         raise SceneError(f"{what} must hold triangles, got none; export a triangle mesh")
@@ -100,9 +106,9 @@ def _shapes(path: Path, what: str, notes: list[str]) -> tuple[dict[str, Any], Fl
     return shapes, corners
 
 
-def _shape(name: str, geometry: trimesh.Trimesh, transform: Floats, path: Path, what: str,
-           notes: list[str]) -> tuple[Any, Floats]:  # fmt: skip
-    """The built mesh in world space and its positions [vertices, 3]."""
+def _part(name: str, geometry: trimesh.Trimesh, transform: Floats, path: Path, what: str,
+          notes: list[str]) -> tuple[Part, Floats]:  # fmt: skip
+    """What builds the mesh in a frame, and its positions [vertices, 3] in the file's."""
     if path.suffix.lower() == ".stl":
         geometry.merge_vertices()
     vertices, faces = np.asarray(geometry.vertices, dtype=np.float64), np.asarray(geometry.faces)
@@ -119,17 +125,20 @@ def _shape(name: str, geometry: trimesh.Trimesh, transform: Floats, path: Path, 
         texcoords = np.asarray(texcoords, dtype=np.float64)[:, :2] * [1, -1] + [0, 1]  # trimesh has v upwards
     material = read_material(geometry, texcoords is not None)
     notes += material.notes
-    mesh = to_mitsuba(
-        name,
-        positions,
-        faces,
-        normals=normals,
-        texcoords=texcoords,
-        attributes=material.attributes,
-        bsdf=mi.load_dict(material.bsdf),
-        emitter=mi.load_dict(material.emitter) if material.emitter else None,
-    )
-    return mesh, positions
+
+    def build(frame: WorldFrame) -> Any:
+        return to_mitsuba(
+            name,
+            frame.local_points(positions),
+            faces,
+            normals=normals,
+            texcoords=texcoords,
+            attributes=material.attributes,
+            bsdf=mi.load_dict(material.bsdf),
+            emitter=mi.load_dict(material.emitter) if material.emitter else None,
+        )
+
+    return build, positions
 
 
 def _file_normals(geometry: trimesh.Trimesh, linear: Floats) -> Floats | None:

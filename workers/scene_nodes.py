@@ -222,7 +222,7 @@ def set_film_size(state: Any, width: int | None, height: int | None, what: str) 
     for film in films:
         for name in ("crop_width", "crop_height", "crop_offset_x", "crop_offset_y"):
             if name in film.props:
-                film.props.remove_property(name)
+                del film.props[name]
         film.props["width"], film.props["height"] = int(width), int(height)
     return int(width), int(height)
 

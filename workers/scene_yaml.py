@@ -132,7 +132,7 @@ def _numbers(value: Any, count: int | None, what: str) -> list[float]:
 def _transform(value: Any, what: str) -> Any:
     """One step or a list of steps, applied to the shape in the order of the list."""
     steps = value if isinstance(value, list) else [value]
-    result = mi.ScalarTransform4f()
+    result = mi.ScalarTransform4d()
     for step in steps:
         if not isinstance(step, dict) or len(step) != 1 or next(iter(step)) not in _STEPS:
             raise SceneError(f"{what} must be one of {', '.join(sorted(_STEPS))} or a list of them, got {step!r}")
@@ -144,31 +144,31 @@ def _transform(value: Any, what: str) -> Any:
 def _look_at(value: Any, what: str) -> Any:
     pose = _keyframe({"fov": DEFAULT_FOV_DEG, **value} if isinstance(value, dict) else value, what)
     camera = _build(pose, Camera(np.eye(4), DEFAULT_FOV_DEG, 1, 1), what)
-    return mi.ScalarTransform4f(camera.to_world.tolist())
+    return mi.ScalarTransform4d(camera.to_world.tolist())
 
 
 def _scale(value: Any, what: str) -> Any:
     factors = [value] * 3 if isinstance(value, int | float) else value
-    return mi.ScalarTransform4f().scale(_numbers(factors, 3, what))
+    return mi.ScalarTransform4d().scale(_numbers(factors, 3, what))
 
 
 def _rotate(value: Any, what: str) -> Any:
     _check_keys(value, {"axis", "angle"}, what, required={"axis", "angle"})
     (angle,) = _numbers([value["angle"]], 1, f"{what}.angle")
-    return mi.ScalarTransform4f().rotate(_numbers(value["axis"], 3, f"{what}.axis"), angle)
+    return mi.ScalarTransform4d().rotate(_numbers(value["axis"], 3, f"{what}.axis"), angle)
 
 
 def _matrix(value: Any, what: str) -> Any:
     flat = [item for row in value for item in row] if isinstance(value, list) and len(value) == 4 else value
     try:
-        return mi.ScalarTransform4f(np.array(_numbers(flat, 16, what)).reshape(4, 4).tolist())
+        return mi.ScalarTransform4d(np.array(_numbers(flat, 16, what)).reshape(4, 4).tolist())
     except TypeError:
         raise SceneError(f"{what} must be 4 rows of 4 numbers, got {value!r}") from None
 
 
 _STEPS: dict[str, Callable[[Any, str], Any]] = {
     "look_at": _look_at,
-    "translate": lambda value, what: mi.ScalarTransform4f().translate(_numbers(value, 3, what)),
+    "translate": lambda value, what: mi.ScalarTransform4d().translate(_numbers(value, 3, what)),
     "scale": _scale,
     "rotate": _rotate,
     "matrix": _matrix,

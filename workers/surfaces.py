@@ -13,6 +13,7 @@ import numpy as np
 from workers.backend import dr, mi
 from workers.errors import SceneError
 from workers.lobes import LobeClass, classify_bsdf
+from workers.world_frame import OWN, WorldFrame
 
 PARAMETRIC_SHAPES = ("Disk", "Sphere", "Cylinder")
 
@@ -32,7 +33,8 @@ class SurfaceTable:
         index_of_registry: stable shape index by registry id; mi.UInt32.
         prim_offset_dr: `prim_offset` on the device; mi.UInt32.
         lobe_bits_dr: `LobeClass` bits by stable shape index; mi.UInt32.
-        diagonal: of the scene's bounding box, scene units.
+        diagonal: of the scene's bounding box.
+        frame: where the scene lies; every length and place here is in that frame's local units.
     """
 
     shapes: list
@@ -45,6 +47,7 @@ class SurfaceTable:
     prim_offset_dr: "mi.UInt32"
     lobe_bits_dr: "mi.UInt32"
     diagonal: float
+    frame: WorldFrame = OWN
 
     @property
     def num_prims(self) -> int:
@@ -124,7 +127,7 @@ def _to_world(shape: "mi.Shape") -> np.ndarray:
     return np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)
 
 
-def build_surface_table(mi_scene: "mi.Scene") -> SurfaceTable:
+def build_surface_table(mi_scene: "mi.Scene", frame: WorldFrame = OWN) -> SurfaceTable:
     """Reads shapes, primitives and material classes of a loaded scene.
 
     Raises:
@@ -157,6 +160,7 @@ def build_surface_table(mi_scene: "mi.Scene") -> SurfaceTable:
         prim_offset_dr=mi.UInt32(offset.astype(np.uint32)),
         lobe_bits_dr=mi.UInt32(np.array([int(lobe) for lobe in lobes], np.uint32)),
         diagonal=float(dr.norm(mi_scene.bbox().extents())),
+        frame=frame,
     )
 
 

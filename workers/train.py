@@ -12,7 +12,7 @@ from torch import Tensor
 from models.losses import LossConfig, ReconstructionLoss
 from models.metrics import exposure_from_luminance, luminance, psnr, tone_map
 from models.network import FusionNet, NetworkConfig
-from models.perceptual import StLpips
+from models.perceptual import MIN_SIZE_PX, StLpips
 from models.transfer import Transfer
 from storage.perceptual_weights import find_stlpips
 from storage.store import UnitRef
@@ -20,7 +20,7 @@ from storage.weights import decode_checkpoint, decode_network, encode_checkpoint
 from workers.errors import WorkerError
 from workers.inputs import load_inputs
 from workers.query import CHANNELS, NUM_CHANNELS
-from workers.reconstruct import GBUFFER_CHANNELS, Encoding, channels_last
+from workers.reconstruct import GBUFFER_CHANNELS, Encoding, FrameModule, channels_last, pad_to_multiple
 from workers.render import load_render
 from workers.run_state import RunState
 from workers.schedule import learning_rate
@@ -115,13 +115,13 @@ class Trainer:
         )  # fmt: skip
         self.network = channels_last(FusionNet(self.config).to(self.device))
         self.optimizer = self._optimizer()
+        self._encode_sets()
         self.loss, self.plain_loss = self._losses()
         self.rng = np.random.default_rng(seed)
         self.step, self.num_steps, self.skipped = 0, 0, 0
         self.autocast = False
         self.curve: list[dict[str, float]] = []
         self._best: dict[str, Tensor] | None = None
-        self._encode_sets()
         self._resume()
 
     # ------------------------------------------------ set-up ------------------------------------------------
@@ -130,7 +130,9 @@ class Trainer:
         """The loss with its perceptual term and the one of the steps between."""
         settings = self.settings
         perceptual = None
-        if settings.perceptual_weight > 0:
+        if 0 < self._crop_size() < MIN_SIZE_PX:
+            self.run.progress.message(f"crops are below ST-LPIPS's {MIN_SIZE_PX} pixels: training without it")
+        elif settings.perceptual_weight > 0:
             weights = find_stlpips()
             if weights is None:
                 self.run.progress.message(
@@ -151,9 +153,13 @@ class Trainer:
 
     def _encode_sets(self) -> None:
         """Frames in network space, kept channels-last."""
-        self.ir, self.gbuffer = self.encoding.inputs(self.train_set.features)
+        ir, gbuffer = self.encoding.inputs(self.train_set.features)
         exposed = self.train_set.target * self.encoding.exposure
-        self.target = self.encoding.transfer.forward(exposed).permute(0, 3, 1, 2)
+        target = self.encoding.transfer.forward(exposed).permute(0, 3, 1, 2)
+        # Frames smaller than the network's multiple are padded, as at inference; larger ones are cropped to it.
+        if min(target.shape[-2:]) < self.config.size_multiple:
+            ir, gbuffer, target = (pad_to_multiple(x, self.config.size_multiple) for x in (ir, gbuffer, target))
+        self.ir, self.gbuffer, self.target = ir, gbuffer, target
 
     def _resume(self) -> None:
         found = latest_checkpoint(self.run, self.ref)
@@ -298,14 +304,12 @@ class Trainer:
 
     @torch.no_grad()
     def _score(self, data: Dataset, index: int) -> float:
-        multiple = self.config.size_multiple
-        height, width = (n // multiple * multiple for n in data.features.shape[1:3])
-        ir, gbuffer = self.encoding.inputs(data.features[index : index + 1, :height, :width])
-        output = self.network(ir.to(self.device), gbuffer.to(self.device))
-        frame = self.encoding.radiance(output)[0].permute(1, 2, 0).cpu().numpy()
-        reference = data.target[index, :height, :width].numpy()
+        """PSNR in dB; 0 for a frame that is not finite, so that its weights are never the best."""
+        frame = FrameModule(self.network, self.encoding)(data.features[index].to(self.device)).cpu().numpy()
+        if not np.isfinite(frame).all():
+            return 0.0
         exposure = self.encoding.exposure
-        return psnr(tone_map(frame, exposure), tone_map(reference, exposure))
+        return psnr(tone_map(frame, exposure), tone_map(data.target[index].numpy(), exposure))
 
     # ---------------------------------------------- persistence --------------------------------------------
 

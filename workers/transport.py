@@ -14,7 +14,10 @@ from workers.backend import dr, mi
 from workers.lobes import context
 
 RR_DEPTH = 5
-RR_MAX_SURVIVAL = 0.95
+# Mitsuba's own 0.95 has infinite variance in a closed box of albedo 0.99: a bounce multiplies the mean of the squared
+# weight by albedo^2 / survival, which must stay below 1.
+RR_MAX_SURVIVAL = 0.99
+TRANSPORT_VERSION = 2  # part of the keys of what is baked; raise it whenever the estimator gives other values
 UNLIMITED_DEPTH = 0xFFFFFFFF
 
 
@@ -43,8 +46,8 @@ class PathStart:
 
 def power_heuristic(pdf_a: "mi.Float", pdf_b: "mi.Float") -> "mi.Float":
     """Weight of the technique with density `pdf_a` against the one with `pdf_b` (beta = 2)."""
-    a2, b2 = dr.square(pdf_a), dr.square(pdf_b)
-    return dr.select(pdf_a > 0, a2 / (a2 + b2), 0.0)
+    # By their ratio: the squares of a tiny light's density overflow, those of a huge light's underflow to 0 / 0.
+    return dr.select(pdf_a > 0, dr.rcp(1 + dr.square(pdf_b / pdf_a)), 0.0)
 
 
 @dr.syntax

@@ -27,7 +27,7 @@ class Hits:
         prim: global primitive, int64 [n].
         uv: barycentrics or surface parameters, float32 [n, 2].
         side: 0 the side of the geometric normal, 1 the other; uint8 [n].
-        footprint: edge of a pixel at the hit in scene units, float32 [n].
+        footprint: edge of a pixel at the hit in the table's local units, float32 [n].
     """
 
     prim: np.ndarray
@@ -71,7 +71,8 @@ def _pose_hits(
     lane = dr.arange(mi.UInt32, width * height)
     rng = mi.PCG32(width * height, initstate=dr.opaque(mi.UInt64, index), initseq=mi.UInt64(lane))
     x, y = lane % width, lane // width
-    ray = DeviceCamera.upload(pose).ray(x + rng.next_float32(), y + rng.next_float32(), width, height)
+    camera = DeviceCamera.upload(table.frame.local_camera(pose))
+    ray = camera.ray(x + rng.next_float32(), y + rng.next_float32(), width, height)
     pixel = dr.opaque(mi.Float, 2 * np.tan(np.radians(pose.fov_deg) / 2) / target_width)
     follows = bool(table.lobe_union & LobeClass.DELTA)
     waves = [(ray, dr.zeros(mi.Float, width * height), 0)]

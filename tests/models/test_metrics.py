@@ -133,7 +133,7 @@ def test_score_frame_fills_every_score_and_is_json() -> None:
     def perceptual(x: object, y: object) -> float:
         return 0.25
 
-    scores = score_frame(noisy(1), noisy(2), 0.7, perceptual)  # type: ignore[arg-type]
+    scores = score_frame(noisy(1, (32, 32)), noisy(2, (32, 32)), 0.7, perceptual)  # type: ignore[arg-type]
     assert scores.non_finite == 0
     assert scores.st_lpips == 0.25
     values = json.loads(json.dumps(scores.to_dict(), allow_nan=False))
@@ -163,4 +163,4 @@ def test_scores_refuse_other_shapes(shape: tuple) -> None:
     with pytest.raises(ShapeError):
         score_frame(np.ones(shape, dtype=np.float32), image(), 1.0)
     with pytest.raises(ShapeError):
-        score_frame(image(0.5, (8, 8)), image(0.5, (8, 8)), 1.0)
+        metrics.ssim(image(0.5, (8, 8)), image(0.5, (8, 8)))
