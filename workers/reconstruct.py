@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from models.metrics import psnr, tone_map
 from models.network import FusionNet, NetworkConfig
 from models.transfer import Transfer
+from workers.backend import pool_at_rest
 from workers.query import CHANNELS
 
 # bf16 is used only where its frame is this close to fp32's: far below what any reference can resolve.
@@ -105,7 +106,7 @@ class Reconstructor:
     def __call__(self, features: np.ndarray) -> np.ndarray:
         """float32 [height, width, NUM_CHANNELS] to linear radiance, float32 [height, width, 3]."""
         height, width = features.shape[:2]
-        with torch.inference_mode():
+        with pool_at_rest(), torch.inference_mode():
             tensor = torch.from_numpy(features).to(self.device, non_blocking=True)
             if (height, width) not in self._chosen:
                 self._chosen[height, width] = self._choose(tensor, (height, width))

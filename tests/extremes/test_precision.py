@@ -20,7 +20,9 @@ from workers.query import CHANNELS, NUM_CHANNELS
 from workers.reconstruct import GBUFFER_CHANNELS, Encoding, FrameModule
 
 CONFIGS = [
-    NetworkConfig(gbuffer_channels=GBUFFER_CHANNELS, widths=(16, 16, 32), fusion=fusion, unshuffle=block, residual=residual)
+    NetworkConfig(
+        gbuffer_channels=GBUFFER_CHANNELS, widths=(16, 16, 32), fusion=fusion, unshuffle=block, residual=residual
+    )
     for fusion, block, residual in itertools.product(("fuse", "concatenate"), (1, 2, 4), (True, False))
 ]  # fmt: skip
 LEAST_DB = {True: 45.0, False: 40.0}
