@@ -27,7 +27,7 @@ ATTRIBUTES = {"directions": [2, 4], "unit": "W/(m^2 sr)"}
 @pytest.fixture(params=["local", "memory", "s3"])
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> Any:
     url = {"local": str(tmp_path / "Läger [1]"), "memory": f"memory://{tmp_path.name}/store"}.get(request.param)
-    url = url or f"s3://{request.getfixturevalue('s3_bucket')}/Läger [1]"
+    url = url or f"{request.getfixturevalue('s3_url')}/Läger [1]"
     store = Store.open(url, create=True)
     store.register_scene(REF.scene_digest, {})
     yield store

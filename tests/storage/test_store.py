@@ -231,8 +231,8 @@ class StoreContract:
 
 class TestS3Store(StoreContract):
     @pytest.fixture
-    def url(self, s3_bucket: str) -> str:
-        return f"s3://{s3_bucket}/Läger [1] #2"
+    def url(self, s3_url: str) -> str:
+        return f"{s3_url}/Läger [1] #2"
 
 
 class TestMemoryStore(StoreContract):
