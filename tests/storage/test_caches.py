@@ -204,6 +204,26 @@ def test_commit_marks_the_set_and_verify_covers_it(store: Store, caches: CacheSe
     assert caches.committed_units() == set()
 
 
+def test_discarded_unit_of_a_finished_set_is_baked_again(store: Store, caches: CacheSet) -> None:
+    fill(caches)
+    caches.commit({})
+    caches.discard_unit(1)
+    assert store.committed(REF) is None
+    assert caches.committed_units() == {0, 2}
+    fill(caches)
+    caches.commit({})
+    assert store.verify() == []
+
+
+def test_quarantined_unit_is_not_committed_and_told(store: Store, caches: CacheSet) -> None:
+    record = caches.quarantine_unit(1, "9 values are NaN", {"nan": 9})
+    assert (record["unit"], record["attempts"], record["facts"]) == (1, 1, {"nan": 9})
+    assert caches.committed_units() == set()
+    assert store.quarantined() == [record]
+    caches.write_unit(1, rows_of(1), {})
+    assert store.quarantined() == []
+
+
 def test_open_refuses_a_set_that_is_not_there(store: Store) -> None:
     with pytest.raises(MissingUnitError, match="run the bake first"):
         CacheSet.open(store, REF)
