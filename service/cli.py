@@ -10,6 +10,7 @@ from service.failures import reported
 from service.jobs_cli import jobs_app
 from service.options import check_writable, parse_look_at, parse_overrides, parse_size
 from service.outcome import Outputs, finish, frame_request_lines
+from service.verify_cli import verify
 
 if TYPE_CHECKING:
     from workers.scene import Scene
@@ -28,7 +29,9 @@ SceneArgument = Annotated[
     str,
     typer.Argument(help="a Mitsuba .xml, a .yaml, a mesh (.glb .gltf .obj .ply .stl), or tabletop or tiny"),
 ]
-StoreOption = Annotated[str, typer.Option("--store", help="folder that holds everything that is computed")]
+StoreOption = Annotated[
+    str, typer.Option("--store", help="folder, or s3://bucket/prefix, that holds everything that is computed")
+]
 PresetOption = Annotated[str, typer.Option("--preset", help="draft, balanced or reference: from fast to accurate")]
 ResolutionOption = Annotated[
     str | None, typer.Option("--resolution", help="WIDTHxHEIGHT in pixels; default: the scene's own")
@@ -264,6 +267,9 @@ def serve(
         from service.serving import serve_store
 
         serve_store(store, host, port)
+
+
+app.command()(verify)
 
 
 def main() -> None:

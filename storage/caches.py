@@ -84,7 +84,12 @@ class CacheSet:
         with _opening(store, ref):
             group = cache_arrays.open_group(store.files, folder)
             specs = [cache_arrays.spec_of(array) for _, array in sorted(group.arrays())]
-            return cls(store, ref, group, specs)
+        if not specs:  # a bake died between making the group and its first array
+            raise MissingUnitError(
+                f"cache set {ref} must hold arrays in store {store.url}, got none in {store.files.path(folder)}; "
+                "run the bake again"
+            )
+        return cls(store, ref, group, specs)
 
     @property
     def num_units(self) -> int:

@@ -107,8 +107,7 @@ def _scene_problems(store: "Store", digest: str, sizes: Sizes) -> Iterator[Probl
         except DamagedUnitError as error:
             yield Problem(str(error), (path,))
     elif stages:
-        folder = store.files.path(layout.scene_folder(digest))
-        yield Problem(f"{folder} is no registered scene; run the scene again")
+        yield Problem(f"{store.files.path(path)} is missing: this is no registered scene; run the scene again")
     for stage, inside in stages.items():
         units = {UnitRef(digest, stage, key): sizes for key, sizes in _by_folder(inside, depth=3).items()}
         yield from _stage_problems(store, units)

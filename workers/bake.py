@@ -16,7 +16,7 @@ from workers.bake_kernels import Batch, bake_diffuse, bake_directional
 from workers.cache_filter import filter_diffuse, filter_directional
 from workers.element_stage import elements_ref
 from workers.elements import ElementSet
-from workers.errors import WorkerError
+from workers.errors import QuarantinedError
 from workers.lobes import reflectance_at
 from workers.query import CacheArrays
 from workers.run_state import RunState
@@ -87,7 +87,7 @@ def run_bake(run: RunState, elements: ElementSet) -> dict[str, UnitRef]:
         Cache set of each lobe ("diffuse", "directional").
 
     Raises:
-        WorkerError: a unit holds more non-finite values than a few stray samples.
+        QuarantinedError: a unit holds more non-finite values than a few stray samples; it was set aside.
     """
     start = time.perf_counter()
     refs = {}
@@ -129,11 +129,19 @@ def _bake_units(run: RunState, lobe: _Lobe, caches: CacheSet, units: list[int], 
     means = {name: (total / passes).astype(np.float32) for name, total in totals.items()}
     seconds = (time.perf_counter() - start) / len(units)
     offset = 0
+    refused: list[QuarantinedError] = []
     for unit, members in zip(units, ranges, strict=True):
         rows = {name: value[offset : offset + len(members)] for name, value in means.items()}
         offset += len(members)
-        health = _checked_health(lobe.name, unit, rows)
-        caches.write_unit(unit, rows, {"seconds": seconds, "health": health})
+        try:
+            health = _checked_health(lobe.name, unit, rows)
+        except QuarantinedError as error:
+            caches.quarantine_unit(unit, str(error), error.facts)
+            refused.append(error)
+        else:
+            caches.write_unit(unit, rows, {"seconds": seconds, "health": health})
+    if refused:  # once the others are kept
+        raise QuarantinedError(f"{refused[0]} (units set aside: {len(refused)})", refused[0].facts)
 
 
 def _checked_health(lobe: str, unit: int, rows: dict[str, np.ndarray]) -> dict[str, int]:
@@ -142,9 +150,10 @@ def _checked_health(lobe: str, unit: int, rows: dict[str, np.ndarray]) -> dict[s
     bad = {name: ~np.isfinite(value) for name, value in rows.items()}
     count = int(sum(mask.sum() for mask in bad.values()))
     if count > MAX_NON_FINITE_SHARE * size:
-        raise WorkerError(
+        raise QuarantinedError(
             f"bake unit {unit} of the {lobe} lobe must be finite, got {count} of {size} values NaN or Inf; "
-            "look for NaN in the scene's textures and materials"
+            "look for NaN in the scene's textures and materials",
+            {"non_finite": count, "values": size, "max_share": MAX_NON_FINITE_SHARE},
         )
     for name, mask in bad.items():
         rows[name][mask] = 0.0

@@ -13,5 +13,21 @@ class SceneError(WorkerError, ValueError):
     """A scene cannot be read, or asks for something that the caches cannot represent."""
 
 
+class VersionError(WorkerError, ValueError):
+    """A run in the store was made by another version of this code."""
+
+
+class QuarantinedError(WorkerError, ArithmeticError):
+    """A unit is over its health limit and was set aside in the store with this reason; a run tries it again.
+
+    Attributes:
+        facts: counts and limits that led to it.
+    """
+
+    def __init__(self, message: str, facts: dict[str, float] | None = None) -> None:
+        super().__init__(message)
+        self.facts = facts or {}
+
+
 class CameraError(WorkerError, ValueError):
     """A camera or a camera path is not usable."""

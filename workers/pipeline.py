@@ -12,6 +12,7 @@ from storage.caches import CacheSet
 from storage.store import Store, UnitRef
 from workers.backend import dr
 from workers.bake import bake_refs, cache_nbytes, load_caches, run_bake
+from workers.code_versions import check_versions
 from workers.element_stage import elements_ref, run_elements
 from workers.elements import ElementSet
 from workers.errors import WorkerError
@@ -78,9 +79,11 @@ def evaluate_scene(scene: Scene, store: Store, settings: Settings, progress: Pro
     """Evaluates what `run_scene` prepared with the settings that it used.
 
     Raises:
-        WorkerError: a stage has not run.
+        WorkerError: a stage has not run, or another version ran it.
     """
     entry = _known(store, scene)
+    if "network" in entry:
+        check_versions(entry, store.url)
     used = Settings.from_json(entry["settings"]) if "settings" in entry else settings
     run = RunState(scene, store, used, progress)
     elements = run_elements(run)

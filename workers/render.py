@@ -8,12 +8,13 @@ from storage.frames import decode_frame, encode_frame, health
 from storage.store import UnitRef
 from workers.camera import Camera
 from workers.denoise import denoise
-from workers.errors import WorkerError
+from workers.errors import QuarantinedError
 from workers.pathtrace import trace
 from workers.run_state import RunState, camera_params
 
 STAGE = "render"
 FILE = "frame.exr"
+MAX_NON_FINITE_SHARE = 1e-3
 
 
 def render_ref(run: RunState, camera: Camera, spp: int) -> UnitRef:
@@ -57,10 +58,13 @@ def _render_frame(run: RunState, ref: UnitRef, camera: Camera, spp: int) -> None
         square += radiance**2
         if image.albedo is not None and image.normal is not None:
             albedo, normal = image.albedo, image.normal
-    if non_finite > 1e-3 * camera.width * camera.height * passes:
-        raise WorkerError(
-            f"ground truth must be finite, got {non_finite} NaN or Inf pixels; look for NaN in the scene's textures"
-        )
+    size = camera.width * camera.height * passes
+    if non_finite > MAX_NON_FINITE_SHARE * size:
+        facts = {"non_finite": non_finite, "pixels": size, "max_share": MAX_NON_FINITE_SHARE}
+        reason = (f"ground truth {ref} must be finite, got {non_finite} of {size} pixels NaN or Inf; "
+                  "look for NaN in the scene's textures")  # fmt: skip
+        run.store.quarantine(ref, reason, facts=facts)
+        raise QuarantinedError(reason, facts)
     mean = total / passes
     variance = np.maximum(square / passes - mean**2, 0.0) / max(passes - 1, 1)
     layers = {"radiance": mean, "standard_error": np.sqrt(variance), "albedo": albedo,

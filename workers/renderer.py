@@ -9,6 +9,7 @@ import numpy as np
 from storage.store import Store, UnitRef
 from workers.bake import load_caches
 from workers.camera import Camera
+from workers.code_versions import ENTRY, check_versions, code_versions
 from workers.element_stage import run_elements
 from workers.errors import WorkerError
 from workers.progress import Progress
@@ -114,7 +115,7 @@ def publish(run: RunState, network_ref: UnitRef, psnr: float | None) -> None:
         {
             "name": run.scene.name, "source": str(run.scene.source), "settings": run.settings.to_json(),
             "network": network_ref.key, "width": run.settings.width, "height": run.settings.height,
-            "preset": run.settings.preset, "psnr": psnr,
+            "preset": run.settings.preset, "psnr": psnr, ENTRY: code_versions(),
         },
     )  # fmt: skip
 
@@ -123,13 +124,14 @@ def open_run(store: Store, entry: dict[str, Any], progress: Progress) -> tuple[R
     """The run that a scene is served from and its network.
 
     Raises:
-        WorkerError: the scene was never run to its end, or its files have changed since.
+        WorkerError: the scene was never run to its end, its files have changed since, or another version ran it.
     """
     if "network" not in entry:
         raise WorkerError(
             f"scene {entry['name']!r} must have a trained network in {store.url}, got none; "
             f"run: lightwell run {entry.get('source', 'SCENE')} --store {store.url}"
         )
+    check_versions(entry, store.url)
     settings = Settings.from_json(entry["settings"])
     scene = load_scene(entry["source"], width=settings.width, height=settings.height)
     if scene.digest != entry["digest"]:

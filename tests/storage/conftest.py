@@ -27,9 +27,15 @@ def s3_endpoint() -> Iterator[str]:
     server.stop()
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def s3_bucket(s3_endpoint: str) -> str:
-    """Name of a fresh bucket."""
+    """Name of a bucket that all tests share; each takes a prefix of its own."""
     name = f"lightwell-{uuid.uuid4().hex[:12]}"
     fsspec.filesystem("s3").mkdir(name)
     return name
+
+
+@pytest.fixture
+def s3_url(s3_bucket: str) -> str:
+    """A place for a store where nothing is."""
+    return f"s3://{s3_bucket}/{uuid.uuid4().hex[:12]}"

@@ -27,7 +27,7 @@ ATTRIBUTES = {"directions": [2, 4], "unit": "W/(m^2 sr)"}
 @pytest.fixture(params=["local", "memory", "s3"])
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> Any:
     url = {"local": str(tmp_path / "Läger [1]"), "memory": f"memory://{tmp_path.name}/store"}.get(request.param)
-    url = url or f"s3://{request.getfixturevalue('s3_bucket')}/Läger [1]"
+    url = url or f"{request.getfixturevalue('s3_url')}/Läger [1]"
     store = Store.open(url, create=True)
     store.register_scene(REF.scene_digest, {})
     yield store
@@ -202,6 +202,26 @@ def test_commit_marks_the_set_and_verify_covers_it(store: Store, caches: CacheSe
     assert store.verify() == []
     store.discard(REF)
     assert caches.committed_units() == set()
+
+
+def test_discarded_unit_of_a_finished_set_is_baked_again(store: Store, caches: CacheSet) -> None:
+    fill(caches)
+    caches.commit({})
+    caches.discard_unit(1)
+    assert store.committed(REF) is None
+    assert caches.committed_units() == {0, 2}
+    fill(caches)
+    caches.commit({})
+    assert store.verify() == []
+
+
+def test_quarantined_unit_is_not_committed_and_told(store: Store, caches: CacheSet) -> None:
+    record = caches.quarantine_unit(1, "9 values are NaN", {"nan": 9})
+    assert (record["unit"], record["attempts"], record["facts"]) == (1, 1, {"nan": 9})
+    assert caches.committed_units() == set()
+    assert store.quarantined() == [record]
+    caches.write_unit(1, rows_of(1), {})
+    assert store.quarantined() == []
 
 
 def test_open_refuses_a_set_that_is_not_there(store: Store) -> None:

@@ -34,8 +34,8 @@ PORT_OF_NOBODY = 9
 
 
 @pytest.fixture
-def url(s3_bucket: str) -> str:
-    return f"s3://{s3_bucket}/prefix"
+def url(s3_url: str) -> str:
+    return s3_url
 
 
 @pytest.fixture
@@ -88,8 +88,10 @@ def test_missing_bucket_is_one_sentence_and_makes_no_bucket(s3_endpoint: str) ->
     assert not fsspec.filesystem("s3").exists("no-such-bucket")
 
 
-def test_bucket_that_vanishes_is_no_empty_store(store: Store, s3_bucket: str) -> None:
-    fsspec.filesystem("s3").rm(s3_bucket, recursive=True)
+def test_bucket_that_vanishes_is_no_empty_store(s3_endpoint: str) -> None:
+    fsspec.filesystem("s3").mkdir("short-lived")
+    store = Store.open("s3://short-lived", create=True)
+    fsspec.filesystem("s3").rm("short-lived", recursive=True)
     for ask in (lambda: store.committed(REF), store.scenes, store.verify, lambda: store.units(DIGEST, "render")):
         with pytest.raises(StoreNotFoundError, match="bucket of store"):
             ask()
@@ -176,14 +178,12 @@ def test_url_without_bucket_or_protocol_is_refused(url: str, s3_endpoint: str) -
 
 
 @pytest.mark.usefixtures("fresh_clients")
-def test_endpoint_and_key_may_come_from_fsspec(
-    s3_endpoint: str, s3_bucket: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_endpoint_and_key_may_come_from_fsspec(s3_endpoint: str, s3_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("AWS_ENDPOINT_URL", "AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
         monkeypatch.delenv(name)
     options = {"endpoint_url": s3_endpoint, "key": "testing", "secret": "testing"}
     monkeypatch.setitem(fsspec.config.conf, "s3", options)  # what FSSPEC_S3_ENDPOINT_URL, ... fill
-    store = Store.open(f"s3://{s3_bucket}/x", create=True)
+    store = Store.open(s3_url, create=True)
     store.register_scene(DIGEST, {})
     bake(store)
     assert store.verify() == []

@@ -214,6 +214,21 @@ class StoreContract:
         assert store.nbytes(REF) == 0
         assert store.verify() == []
 
+    def test_quarantine_stands_until_the_unit_is_committed(self, store: Store) -> None:
+        assert store.quarantined() == []
+        first = store.quarantine(REF, "7 pixels are NaN", facts={"nan": 7})
+        assert (first["reason"], first["cause"], first["facts"]) == ("7 pixels are NaN", "health", {"nan": 7})
+        assert (first["stage"], first["key"], first["unit"]) == (REF.stage, REF.key, None)
+        again = store.quarantine(REF, "3 pixels are NaN")
+        assert (first["attempts"], again["attempts"]) == (1, 2)
+        assert store.committed(REF) is None
+        assert store.units(DIGEST, "render") == []
+        assert store.quarantined() == store.quarantined(DIGEST) == [again]
+        assert store.quarantined("fedcba9876543210") == []
+        assert store.verify() == []  # nothing is damaged
+        store.commit(REF, FILES, {})
+        assert store.quarantined() == []
+
     def test_units_of_an_unknown_stage_are_none(self, store: Store) -> None:
         assert store.units(DIGEST, "nothing") == []
 
@@ -231,8 +246,8 @@ class StoreContract:
 
 class TestS3Store(StoreContract):
     @pytest.fixture
-    def url(self, s3_bucket: str) -> str:
-        return f"s3://{s3_bucket}/Läger [1] #2"
+    def url(self, s3_url: str) -> str:
+        return f"{s3_url}/Läger [1] #2"
 
 
 class TestMemoryStore(StoreContract):
