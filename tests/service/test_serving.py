@@ -7,11 +7,10 @@ import urllib.request
 from typing import Any
 
 import pytest
-import uvicorn
 
 from service.app import create_app
 from service.errors import OptionError
-from service.serving import bind, is_loopback
+from service.serving import bind, is_loopback, make_server
 
 
 @pytest.mark.parametrize(
@@ -38,7 +37,7 @@ def test_a_bound_socket_is_served(backend: Any) -> None:
     app = create_app("unused", make_backend=lambda: backend)
     with bind("127.0.0.1", 0) as listener:
         assert listener.family == socket.AF_INET
-        server = uvicorn.Server(uvicorn.Config(app, log_level="error"))
+        server = make_server(app, log_level="error")
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         deadline_s = time.monotonic() + 10
