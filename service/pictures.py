@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from workers.camera import Camera
 
 DEFAULT_QUEUE_LIMIT = 64
-DEFAULT_RECENT_NBYTES = 64 * 2**20
+DEFAULT_RECENT_NBYTES = 32 * 2**20
 NUM_ENCODERS = 2
 FIRST_GUESS_S = 0.5
 """Seconds that a frame is thought to take before one was measured."""

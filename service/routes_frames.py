@@ -73,12 +73,11 @@ async def _gone(request: Request) -> None:
 
 
 def frame_response(picture: Picture) -> Response:
-    """A picture with its headers."""
-    return Response(
+    """A picture with its headers; one that was remembered has no times."""
+    response = Response(
         picture.content,
         media_type=picture.media_type,
         headers={
-            "Server-Timing": server_timing(picture.seconds),
             "X-Lightwell-Coverage": f"{picture.coverage:.4f}",
             "X-Lightwell-Exposure": f"{picture.exposure:.6g}",
             "X-Lightwell-Non-Finite": "0",
@@ -88,6 +87,9 @@ def frame_response(picture: Picture) -> Response:
             "Vary": "Accept",
         },
     )
+    if picture.seconds:
+        response.headers["Server-Timing"] = server_timing(picture.seconds)
+    return response
 
 
 def add_frame_routes(app: FastAPI, pictures: Pictures, *, max_pixels: int) -> None:
