@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -126,3 +127,16 @@ def evaluation() -> FakeEvaluation:
 @pytest.fixture
 def backend() -> FakeBackend:
     return FakeBackend()
+
+
+@pytest.fixture
+def until() -> Callable[[Callable[[], bool]], None]:
+    """Waits until something is true; fails after ten seconds."""
+
+    def wait(true: Callable[[], bool]) -> None:
+        deadline_s = time.monotonic() + 10
+        while not true():
+            assert time.monotonic() < deadline_s, "it did not come true within 10 s"
+            time.sleep(0.005)
+
+    return wait

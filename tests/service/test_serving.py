@@ -1,5 +1,6 @@
 """The server's socket, and a real server on it."""
 
+import signal
 import socket
 import threading
 import time
@@ -31,6 +32,19 @@ def test_is_loopback(host: str, loopback: bool) -> None:
 def test_a_port_in_use_is_an_option_error() -> None:
     with bind("127.0.0.1", 0) as taken, pytest.raises(OptionError, match="choose another --host or --port"):
         bind("127.0.0.1", taken.getsockname()[1])
+
+
+def test_answers_wait_for_no_acknowledgement() -> None:
+    with bind("127.0.0.1", 0) as listener, socket.create_connection(listener.getsockname()):
+        accepted, _ = listener.accept()
+        with accepted:
+            assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) != 0
+
+
+def test_a_server_told_to_stop_is_not_ready(backend: Any) -> None:
+    app = create_app("unused", make_backend=lambda: backend)
+    make_server(app).handle_exit(signal.SIGTERM, None)
+    assert app.state.readiness.phase == "stopping"
 
 
 def test_a_bound_socket_is_served(backend: Any) -> None:
