@@ -40,9 +40,6 @@ class FrameMetrics:
         )
         for reason in ("queue_full", "stopping"):
             self.rejected.labels(reason)
-        self.not_modified = Counter(
-            "lightwell_frames_not_modified", "Frame requests answered 304", registry=self.registry
-        )
         self.abandoned = Counter(
             "lightwell_frames_abandoned", "Frame requests whose client went away before the answer",
             registry=self.registry,
