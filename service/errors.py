@@ -45,10 +45,6 @@ class NotReadyError(ServiceError, LookupError):
     """The job exists; what was asked of it does not yet."""
 
 
-class BusyError(ServiceError, RuntimeError):
-    """More was asked at once than the service takes; asking again later helps."""
-
-
 class JobDatabaseError(ServiceError, OSError):
     """The job database cannot be reached or is not ours."""
 
@@ -63,3 +59,39 @@ class UnreachableError(ServiceError, OSError):
 
 class RequestRefusedError(ServiceError, ValueError):
     """A service answered a request of ours with an error."""
+
+
+class NonFiniteFrameError(ServiceError, ArithmeticError):
+    """A frame holds NaN or infinity; such pixels are never served.
+
+    Attributes:
+        non_finite: how many values.
+    """
+
+    def __init__(self, message: str, non_finite: int) -> None:
+        super().__init__(message)
+        self.non_finite = non_finite
+
+
+class SceneTooLargeError(ServiceError, MemoryError):
+    """A scene alone needs more memory than all open scenes may take."""
+
+
+class BusyError(ServiceError, RuntimeError):
+    """More was asked at once than the service takes; asking again later helps.
+
+    Attributes:
+        retry_after_s: whole seconds after which a client may ask again, at least 1.
+    """
+
+    def __init__(self, message: str, retry_after_s: int = 5) -> None:
+        super().__init__(message)
+        self.retry_after_s = retry_after_s
+
+
+class StoppingError(BusyError):
+    """The service is on its way out; another instance, or the next one, has to answer."""
+
+
+class ClientGoneError(ServiceError, ConnectionError):
+    """The client closed its connection before it was answered."""

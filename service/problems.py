@@ -18,6 +18,8 @@ from workers.job_spec import JobSpecError
 from workers.settings import SettingsError
 
 PROBLEM = "application/problem+json"
+CLIENT_GONE = 499
+"""Of a request whose client went away; nobody reads it, access logs show it (nginx's number)."""
 log = logging.getLogger("lightwell.service")
 
 STATUS_OF_ERROR: dict[type[Exception], int] = {
@@ -34,9 +36,12 @@ STATUS_OF_ERROR: dict[type[Exception], int] = {
     JobSpecError: 422,
     SceneError: 422,
     SettingsError: 422,
-    errors.BusyError: 503,
     errors.JobDatabaseError: 503,
     SQLAlchemyError: 503,
+    errors.ClientGoneError: CLIENT_GONE,
+    errors.NonFiniteFrameError: 500,
+    errors.BusyError: 503,
+    errors.SceneTooLargeError: 507,
     errors.ServiceError: 500,
     WorkerError: 500,
     StorageError: 500,
@@ -66,7 +71,8 @@ def problem_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
 
 def problem(status: int, detail: str, **extra: Any) -> JSONResponse:
     """A problem document; `title` is the status' own phrase, so `type` is about:blank and left out."""
-    content = {"title": HTTPStatus(status).phrase, "status": status, "detail": detail, **extra}
+    title = HTTPStatus(status).phrase if status != CLIENT_GONE else "Client Closed Request"
+    content = {"title": title, "status": status, "detail": detail, **extra}
     return JSONResponse(content, status_code=status, media_type=PROBLEM)
 
 
@@ -77,13 +83,17 @@ def _detail(error: Exception) -> str:
 
 
 def _known_error(_: Request, error: Exception) -> JSONResponse:
+    """Every 503 says when to ask again; being busy is no failure and fills no log."""
     status = next(STATUS_OF_ERROR[kind] for kind in type(error).__mro__ if kind in STATUS_OF_ERROR)
     detail = _detail(error) or "not enough memory for this frame; choose a smaller size"
-    if status >= 500:
+    is_busy = isinstance(error, errors.BusyError)
+    if status >= 500 and not is_busy:
         log.error("%s: %s", type(error).__name__, detail)
-    response = problem(status, detail)
+    extra = {"non_finite": error.non_finite} if isinstance(error, errors.NonFiniteFrameError) else {}
+    response = problem(status, detail, **extra)
     if status == HTTPStatus.SERVICE_UNAVAILABLE:
-        response.headers["Retry-After"] = str(RETRY_AFTER_S)
+        wait_s = error.retry_after_s if isinstance(error, errors.BusyError) else RETRY_AFTER_S
+        response.headers["Retry-After"] = str(wait_s)
     return response
 
 

@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,13 +13,17 @@ from workers.camera import Camera
 from workers.code_versions import ENTRY, check_versions, code_versions
 from workers.element_stage import run_elements
 from workers.errors import WorkerError
+from workers.footprint import scene_nbytes
 from workers.progress import Progress
+from workers.published import renderable_scenes
 from workers.query import CHANNELS, QueryProgram
 from workers.reconstruct import Reconstructor
 from workers.run_state import RunState
 from workers.scene import load_scene
 from workers.settings import Settings
 from workers.train import load_network
+
+__all__ = ["Frame", "FrameRenderer", "open_run", "publish", "renderable_scenes"]
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,11 @@ class FrameRenderer:
         if warm_up:
             renderer.render(run.scene.camera.resized(run.settings.width, run.settings.height))
         return renderer
+
+    @cached_property
+    def nbytes(self) -> int:
+        """Memory that the open scene holds, bytes (`workers/footprint.py`)."""
+        return scene_nbytes(self.program, self.reconstructor)
 
     def render(self, camera: Camera) -> Frame:
         """Reconstructs the frame of a camera; any pose is answered."""
@@ -140,9 +150,3 @@ def open_run(store: Store, entry: dict[str, Any], progress: Progress) -> tuple[R
             f"run: lightwell run {entry['source']} --store {store.url}"
         )
     return RunState(scene, store, settings, progress), UnitRef(scene.digest, "train", entry["network"])
-
-
-def renderable_scenes(store: Store) -> list[dict[str, Any]]:
-    """Scenes of a store that can be served."""
-    names = ("name", "digest", "width", "height", "preset", "psnr")
-    return [{name: entry.get(name) for name in names} for entry in store.scenes() if "network" in entry]
