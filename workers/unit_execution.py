@@ -1,5 +1,6 @@
 """Executes one unit of a run. A unit may be run again at any time: what is committed is left as it is."""
 
+import copy
 import dataclasses
 import json
 from collections.abc import Callable
@@ -157,7 +158,7 @@ def _train(unit: Unit, loaded: LoadedRun) -> UnitRef:
 
 def _evaluate(unit: Unit, loaded: LoadedRun, report: Report | None) -> str:
     """Measures once, keeps what was measured, and makes the run the one that its scene is served from."""
-    run = dataclasses.replace(loaded.run)
+    run = copy.copy(loaded.run)  # with what it has loaded, but other test frames
     tests = _kept(run, "test", unit)
     run.paths = dataclasses.replace(loaded.run.paths, test=tests)
     network = _train(unit, loaded)

@@ -142,6 +142,14 @@ class Inventory:
 
 
 CENSUS = Block("census")
+# What workers take up first where several blocks are ready: what most depends on, then what training needs.
+PRIORITY = ("census", "elements", "inventory", "bake", "seal", "inputs", "render train", "render validation", "train",
+            "render test", "evaluate")  # fmt: skip
+
+
+def by_priority(block: Block) -> int:
+    """Sort key of a block: its place in `PRIORITY`."""
+    return PRIORITY.index(block.name if block.name in PRIORITY else block.stage)
 
 
 def blocks_after_census(census: Census, last_stage: str) -> list[Block]:
@@ -156,12 +164,12 @@ def blocks_after_census(census: Census, last_stage: str) -> list[Block]:
 
 
 def blocks_after_inventory(census: Census, inventory: Inventory, last_stage: str) -> list[Block]:
-    """Bakes, and what is made of them; in the order in which workers should take them up."""
+    """Bakes, and what is made of them."""
     blocks = []
     for lobe, found in inventory.lobes.items():
-        keys = (found.key,)
-        blocks.append(Block("bake", lobe, found.num_units, found.group, keys, needs=("inventory",)))
-        blocks.append(Block("seal", lobe, keys=keys, needs=(f"bake {lobe}",)))
+        key = (found.key,)
+        blocks.append(Block("bake", lobe, found.num_units, found.group, key, needs=("inventory",)))
+        blocks.append(Block("seal", lobe, keys=key, needs=(f"bake {lobe}",)))
     if not _reaches(last_stage, "train"):
         return blocks
     sealed = ("inventory", *(f"seal {lobe}" for lobe in inventory.lobes))
