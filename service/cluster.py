@@ -38,6 +38,8 @@ DASK_CONFIG: dict[str, Any] = {
     "distributed.nanny.pre-spawn-environ": {},
 }
 
+NO_DASHBOARD = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}
+
 
 class SchedulerError(ServiceError, OSError):
     """No scheduler answers at the address."""
@@ -72,7 +74,7 @@ class Cluster:
         environment = threads.environment
         with dask.config.set(DASK_CONFIG):
             self._own = LocalCluster(
-                n_workers=num_workers, threads_per_worker=1, processes=True, dashboard_address=None,
+                n_workers=num_workers, threads_per_worker=1, processes=True, scheduler_kwargs=NO_DASHBOARD,
                 env=environment, resources=gpu_resources(), silence_logs=logging.CRITICAL,
             )  # fmt: skip
             self._address = self._own.scheduler_address

@@ -251,10 +251,10 @@ class JobRun:
         """The frame that was rendered last, now and then."""
         if time.monotonic() - self._previewed_s < SECONDS_BETWEEN_PREVIEWS:
             return
-        self._previewed_s = time.monotonic()
         from service.preview import preview_png
 
         png = preview_png(self._store, UnitRef(self._census.digest, "render", unit.key))
+        self._previewed_s = time.monotonic()
         if png is not None:
             self._on_event({"kind": "preview", "png": png})
 

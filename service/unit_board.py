@@ -26,7 +26,7 @@ log = logging.getLogger("lightwell.engine")
 
 MAX_ATTEMPTS = 3
 MAX_DEATHS_NEARBY = 12  # of workers that held a unit but had not said that they began it
-SECONDS_TO_LEAVE = 6.0  # for a unit that nobody wants; after that its process is replaced
+SECONDS_TO_LEAVE = 4.0  # for a unit that nobody wants; Dask then gives its process as long again before it is killed
 TICK_SECONDS = 0.5
 _ANSWERED = ("census", "inventory", "train", "evaluate")  # stages whose answer somebody reads; the others' is the store
 _GPU_STAGE = "train"

@@ -33,7 +33,7 @@ def run_in_process(spec: JobSpec, store_url: str) -> None:
 
 def committed(store: Path) -> dict[str, str]:
     """Path and hash of every committed file, and of every marker without its times."""
-    found = {"scene.json": _plain(path) for path in store.glob("scenes/*/scene.json")}
+    found = {str(path.relative_to(store)): _plain(path) for path in store.glob("scenes/*/scene.json")}
     for marker in [*store.glob("scenes/*/*/*/commit.json"), *store.glob("scenes/*/*/*/units/*.json")]:
         folder = marker.parent if marker.name == "commit.json" else marker.parent.parent
         if folder.parent.name in MEASURED:
