@@ -41,6 +41,7 @@ class FakeStages:
         digest: of its scene; jobs of one digest share units.
         variant: of its training.
         seconds: of a unit, in `PASSES` passes.
+        slow: stage whose units take `seconds`; "" for all of them.
         num_bake_units: of its one cache set.
         failing: names of units that always fail.
         killing: names of units whose process is killed, for as long as `folder/kill <name>` holds lives.
@@ -51,6 +52,7 @@ class FakeStages:
     digest: str = "fa4e"
     variant: int = 0
     seconds: float = 0.0
+    slow: str = ""
     num_bake_units: int = 20
     failing: tuple[str, ...] = ()
     killing: tuple[str, ...] = ()
@@ -58,9 +60,10 @@ class FakeStages:
 
     def __call__(self, unit: Unit, store_url: str, progress: Progress) -> Any:
         self._note("started", f"{unit.name},{os.getpid()},{self.variant}")
+        seconds = self.seconds if self.slow in ("", unit.stage) else 0.0
         with progress.track(unit.name, PASSES) as advance:
             for _ in range(PASSES):
-                time.sleep(self.seconds / PASSES)
+                time.sleep(seconds / PASSES)
                 if not self.deaf:
                     advance(note="pass")
         if unit.name in self.failing:

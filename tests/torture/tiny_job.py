@@ -8,6 +8,7 @@ from typing import Any
 from workers.job_spec import JobSpec
 from workers.settings import Settings
 
+ROOT = Path(__file__).parents[2]
 TIMES = ("created_unix_s", "seconds")  # of a marker: when and how long, not what
 MEASURED = ("evaluation",)  # stages whose files hold times
 

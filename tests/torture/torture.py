@@ -17,11 +17,13 @@ from pathlib import Path
 
 from tests.torture.crew import ROOT, TRAINER, VICTIMS, Crew
 from tests.torture.tiny_job import committed, differences
+from tests.torture.trainer import torment_trainer
 
 STAGES = ("start", "census", "elements", "bake", "inputs", "render", "train", "evaluate")
 MAX_KILLS_A_STAGE = 2  # of one job: a unit that dies three times is set aside, which is not what is tested here
 JOB_SECONDS = 400
-SETTINGS = {"train.epochs": 12, "cache.diffuse_spp": 256, "frames.test_spp": 256}
+TRAINER_KILLS = 8
+SETTINGS = {"cache.diffuse_spp": 256, "frames.test_spp": 256}
 
 Kills = Counter[tuple[str, str]]
 
@@ -72,15 +74,15 @@ def main() -> int:
 
 def run(folder: Path, wanted: int, seed: int, num_workers: int) -> int:
     rng, kills, bad = random.Random(seed), Counter[tuple[str, str]](), 0
-    settings = json.dumps(SETTINGS)
-    subprocess.run([sys.executable, "-m", "tests.torture.undisturbed", str(folder / "undisturbed"), settings],
+    settings, job_settings = json.dumps(SETTINGS), json.dumps({**SETTINGS, "train.epochs": 12})
+    subprocess.run([sys.executable, "-m", "tests.torture.undisturbed", str(folder / "undisturbed"), job_settings],
                    cwd=ROOT, check=True)  # fmt: skip
     expected = committed(folder / "undisturbed")
     job = 0
     while kills.total() < wanted:
         job += 1
         before, start = kills.total(), time.monotonic()
-        with Crew(folder / f"job-{job}", num_workers, ["--settings", settings]) as crew:
+        with Crew(folder / f"job-{job}", num_workers, ["--settings", job_settings]) as crew:
             complete = torment(crew, kills, rng, wanted)
         last = crew.events()[-1] if crew.events() else {}
         found = committed(crew.store) if crew.store.exists() else {}
@@ -92,7 +94,9 @@ def run(folder: Path, wanted: int, seed: int, num_workers: int) -> int:
               f"{len(found)} files, {len(wrong)} differ {wrong[:3]}", flush=True)  # fmt: skip
     print(f"\n{table(kills)}\n\n{job} jobs, {kills.total()} kills, {len(expected)} committed files compared a job, "
           f"{bad} jobs not as they should be (seed {seed})")  # fmt: skip
-    return 1 if bad else 0
+    trainer_kills, resumed, wrong = torment_trainer(folder / "undisturbed", folder, rng, TRAINER_KILLS, settings)
+    print(f"trainer alone: {trainer_kills} kills, {resumed} lives from a checkpoint, {wrong} losses differ")
+    return 1 if bad or wrong or not resumed else 0
 
 
 if __name__ == "__main__":
