@@ -4,6 +4,7 @@
 #   make check    lint, format, types, layering
 #   make format   put the code into the house format
 #   make benchmarks SCENES="a.xml tabletop"   measure scenes and write docs/benchmarks.md of all measured so far
+#   make torture  kill workers, scheduler, service and trainer at random for a quarter of an hour; compare every byte
 #   make clean    remove the environment and what the tools left
 
 # The CPU build of torch is the default. For the build of your package index (CUDA on Linux): make TORCH=any ...
@@ -19,7 +20,7 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 CONSTRAINTS := -c constraints.txt $(if $(filter cpu,$(TORCH)),-c constraints-cpu.txt)
 
-.PHONY: demo test check format benchmarks clean venv
+.PHONY: demo test check format benchmarks torture clean venv
 .DELETE_ON_ERROR:
 
 demo: .venv/.ready
@@ -41,6 +42,9 @@ format: .venv/.ready
 benchmarks: .venv/.ready
 	$(BIN)/lightwell benchmark --store $(STORE) --output docs/benchmarks.md \
 	  $(foreach scene,$(SCENES),--scene $(scene)) $(BENCHMARK_OPTIONS)
+
+torture: .venv/.ready
+	$(BIN)/python -m tests.torture.torture $(TORTURE_OPTIONS)
 
 venv: .venv/.ready
 

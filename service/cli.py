@@ -1,6 +1,7 @@
 """The `lightwell` command. Mitsuba and torch are imported inside the commands: --help answers at once."""
 
 import os
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -274,6 +275,24 @@ def serve(
 
 
 app.command()(verify)
+
+
+@app.command()
+def worker(
+    scheduler: Annotated[str, typer.Option("--scheduler", help="address of a Dask scheduler, tcp://host:8786")],
+    threads: Annotated[int, typer.Option("--threads", min=1, help="of a unit of bake, render or inputs")] = 1,
+    train_threads: Annotated[int, typer.Option("--train-threads", min=0, help="of training; 0: all cores")] = 0,
+    name: Annotated[str | None, typer.Option("--name", help="by which retries tell workers apart")] = None,
+    memory_limit: Annotated[str, typer.Option("--memory-limit", help="such as 8GiB; auto: the machine's")] = "auto",
+    folder: Annotated[str, typer.Option("--folder", help="for Dask's scratch files")] = tempfile.gettempdir(),
+) -> None:
+    """Work for a scheduler: one unit at a time, as many of these as the machine has cores for."""
+    with reported():
+        from service.worker_process import run_worker
+        from workers.thread_policy import ThreadPolicy
+
+        policy = ThreadPolicy(threads, train_threads or os.cpu_count() or 1)
+        run_worker(scheduler, threads=policy, name=name, memory_limit=memory_limit, folder=folder)
 
 
 def main() -> None:

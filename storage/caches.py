@@ -20,7 +20,7 @@ from storage.layout import UnitRef
 from storage.store import Store
 from storage.verification import difference
 
-__all__ = ["ArraySpec", "CacheSet"]
+__all__ = ["ArraySpec", "CacheSet", "marked_units"]
 
 _SHOWN = 8  # indices named in an error
 
@@ -141,9 +141,7 @@ class CacheSet:
 
     def committed_units(self) -> set[int]:
         """Indices of the units whose marker is there. Resume = range(num_units) minus these."""
-        names = self.store.files.names(layout.bake_markers_folder(self.ref.folder))
-        indices = {layout.bake_marker_index(name) for name in names}
-        return {index for index in indices if index is not None and index < self.num_units}
+        return {index for index in marked_units(self.store, self.ref) if index < self.num_units}
 
     def unit_record(self, index: int) -> dict[str, Any] | None:
         """Fields of a unit's marker; None where it is not committed.
@@ -248,6 +246,12 @@ class CacheSet:
             f"but {self.store.files.path(path)} {problem}; "
             f"run: lightwell verify --store {self.store.url} --repair, then run the scene again"
         )
+
+
+def marked_units(store: Store, ref: UnitRef) -> set[int]:
+    """Indices of the bake units with a marker, of a cache set that need not exist yet: what a plan asks."""
+    indices = (layout.bake_marker_index(name) for name in store.files.names(layout.bake_markers_folder(ref.folder)))
+    return {index for index in indices if index is not None}
 
 
 @contextlib.contextmanager

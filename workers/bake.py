@@ -94,24 +94,84 @@ def run_bake(run: RunState, elements: ElementSet) -> dict[str, UnitRef]:
     for lobe in _lobes(run, elements):
         refs[lobe.name] = run.ref(STAGE, lobe.params)
         if run.store.committed(refs[lobe.name]) is None:
-            _bake_lobe(run, lobe, refs[lobe.name])
+            caches = _cache_set(run, lobe)
+            _bake_missing(run, lobe, caches, sorted(set(range(caches.num_units)) - caches.committed_units()))
+            _seal(run, lobe, caches)
             run.seconds[STAGE] = time.perf_counter() - start
     return refs
 
 
-def _bake_lobe(run: RunState, lobe: _Lobe, ref: UnitRef) -> None:
-    per_unit = run.settings.cache.elements_per_unit
-    rows = len(lobe.owners)
+@dataclasses.dataclass(frozen=True)
+class BakeSet:
+    """One lobe's cache set as a plan sees it.
+
+    Attributes:
+        ref: its address.
+        num_units: bake units.
+        lanes_per_unit: paths of one unit, all passes.
+    """
+
+    ref: UnitRef
+    num_units: int
+    lanes_per_unit: int
+
+
+def bake_sets(run: RunState, elements: ElementSet) -> dict[str, BakeSet]:
+    """What there is to bake, by lobe."""
+    per_unit, passes = run.settings.cache.elements_per_unit, run.settings.cache.passes
+    return {
+        lobe.name: BakeSet(run.ref(STAGE, lobe.params), -(-len(lobe.owners) // per_unit),
+                           lobe.lanes_per_element * per_unit * passes)
+        for lobe in _lobes(run, elements)
+    }  # fmt: skip
+
+
+def bake_units(run: RunState, elements: ElementSet, lobe_name: str, units: range) -> UnitRef:
+    """Bakes those of some units of one lobe that the store lacks.
+
+    Raises:
+        WorkerError: a unit holds more non-finite values than a few stray samples.
+    """
+    lobe = _lobe(run, elements, lobe_name)
+    caches = _cache_set(run, lobe)
+    _bake_missing(run, lobe, caches, [unit for unit in units if caches.unit_record(unit) is None])
+    return caches.ref
+
+
+def seal_bake(run: RunState, elements: ElementSet, lobe_name: str) -> UnitRef:
+    """Marks a lobe's cache set as done.
+
+    Raises:
+        MissingUnitError: a unit is not committed.
+    """
+    lobe = _lobe(run, elements, lobe_name)
+    caches = _cache_set(run, lobe)
+    _seal(run, lobe, caches)
+    return caches.ref
+
+
+def _lobe(run: RunState, elements: ElementSet, name: str) -> _Lobe:
+    return next(lobe for lobe in _lobes(run, elements) if lobe.name == name)
+
+
+def _cache_set(run: RunState, lobe: _Lobe) -> CacheSet:
+    per_unit, rows = run.settings.cache.elements_per_unit, len(lobe.owners)
     specs = [ArraySpec(name, (rows, *shape), "float32", per_unit) for name, shape in lobe.arrays.items()]
-    caches = CacheSet.create_or_open(run.store, ref, specs, {"lobe": lobe.name, **lobe.params})
-    missing = sorted(set(range(caches.num_units)) - caches.committed_units())
+    ref = run.ref(STAGE, lobe.params)
+    return CacheSet.create_or_open(run.store, ref, specs, {"lobe": lobe.name, **lobe.params})
+
+
+def _bake_missing(run: RunState, lobe: _Lobe, caches: CacheSet, missing: list[int]) -> None:
+    per_unit = run.settings.cache.elements_per_unit
     per_launch = max(1, LANES_PER_LAUNCH // (lobe.lanes_per_element * per_unit))
-    with run.progress.track(f"bake {lobe.name}", caches.num_units) as advance:
-        advance(caches.num_units - len(missing))
+    with run.progress.track(f"bake {lobe.name}", len(missing)) as advance:
         for first in range(0, len(missing), per_launch):
             units = missing[first : first + per_launch]
             _bake_units(run, lobe, caches, units, per_unit)
             advance(len(units))
+
+
+def _seal(run: RunState, lobe: _Lobe, caches: CacheSet) -> None:
     caches.commit({"params": lobe.params, "passes": run.settings.cache.passes})
 
 
@@ -126,6 +186,7 @@ def _bake_units(run: RunState, lobe: _Lobe, caches: CacheSet, units: list[int], 
     for index in range(passes):
         for name, value in lobe.kernel(batch, index).items():
             totals[name] = totals.get(name, 0.0) + value.astype(np.float64)
+        run.progress.between_passes()
     means = {name: (total / passes).astype(np.float32) for name, total in totals.items()}
     seconds = (time.perf_counter() - start) / len(units)
     offset = 0

@@ -31,3 +31,11 @@ class QuarantinedError(WorkerError, ArithmeticError):
 
 class CameraError(WorkerError, ValueError):
     """A camera or a camera path is not usable."""
+
+
+class StoppedError(WorkerError):
+    """Somebody asked for a stop between two passes; what was committed before is kept."""
+
+
+class ChangedSceneError(WorkerError):
+    """A unit was planned for a scene whose files have changed since."""

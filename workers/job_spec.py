@@ -1,5 +1,6 @@
 """What a job asks of the stages: a scene, all settings, and how far along the pipeline to go."""
 
+import json
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,8 +31,19 @@ class JobSpec:
     stages: tuple[str, ...] = STAGES
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "stages", tuple(self.stages))
         if not self.stages or tuple(self.stages) != STAGES[: len(self.stages)]:
             raise JobSpecError(
                 f"stages must be the first of {', '.join(STAGES)}, in that order, got {list(self.stages)}; "
                 "a later stage needs those before it"
             )
+
+    @property
+    def last_stage(self) -> str:
+        """The latest stage asked for."""
+        return self.stages[-1]
+
+    @property
+    def canonical(self) -> str:
+        """One text for every spec that means the same run, whatever its stages."""
+        return json.dumps([self.scene, self.settings], sort_keys=True, default=str)

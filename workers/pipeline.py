@@ -55,7 +55,7 @@ def run_scene(
     """
     width, height = camera_size or (settings.width, settings.height)
     run = RunState(scene, store, settings.override({"width": width, "height": height}), progress)
-    store.register_scene(scene.digest, _known(store, scene) | {"name": scene.name, "source": str(scene.source)})
+    store.register_scene(scene.digest, known_facts(store, scene) | {"name": scene.name, "source": str(scene.source)})
     elements = run_elements(run)
     run_bake(run, elements)
     frames = run.settings.frames
@@ -64,13 +64,13 @@ def run_scene(
         "validation": run_render(run, run.paths.validation, frames.train_spp, RENDER_STAGES["validation"]),
         "test": run_render(run, run.paths.test, frames.test_spp, RENDER_STAGES["test"]),
     }
-    program = _program(run, elements)
+    program = query_program(run, elements)
     inputs = {
         "train": run_inputs(run, elements, program, run.paths.train),
         "validation": run_inputs(run, elements, program, run.paths.validation),
     }
     network = run_train(run, (inputs["train"], renders["train"]), (inputs["validation"], renders["validation"]))
-    evaluation = _evaluate(run, elements, program, network, renders["test"])
+    evaluation = evaluate_run(run, elements, program, network, renders["test"])
     publish(run, network, evaluation.result["rows"][0]["psnr"])
     return evaluation
 
@@ -81,7 +81,7 @@ def evaluate_scene(scene: Scene, store: Store, settings: Settings, progress: Pro
     Raises:
         WorkerError: a stage has not run, or another version ran it.
     """
-    entry = _known(store, scene)
+    entry = known_facts(store, scene)
     if "network" in entry:
         check_versions(entry, store.url)
     used = Settings.from_json(entry["settings"]) if "settings" in entry else settings
@@ -96,10 +96,10 @@ def evaluate_scene(scene: Scene, store: Store, settings: Settings, progress: Pro
             f"scene {scene.name!r} must be run before it is evaluated; "
             f"run: lightwell run {scene.source} --store {store.url}"
         )
-    return _evaluate(run, elements, _program(run, elements), network, renders["test"])
+    return evaluate_run(run, elements, query_program(run, elements), network, renders["test"])
 
 
-def _known(store: Store, scene: Scene) -> dict[str, Any]:
+def known_facts(store: Store, scene: Scene) -> dict[str, Any]:
     """What the store says of the scene, without the fields that the store adds itself."""
     for entry in store.scenes():
         if entry["digest"] == scene.digest:
@@ -107,14 +107,20 @@ def _known(store: Store, scene: Scene) -> dict[str, Any]:
     return {}
 
 
-def _program(run: RunState, elements: ElementSet) -> QueryProgram:
+def query_program(run: RunState, elements: ElementSet) -> QueryProgram:
+    """The query over the caches of a run.
+
+    Raises:
+        StorageError: a bake unit is missing or damaged.
+    """
     caches = load_caches(run, elements)
     return QueryProgram(run.scene.mi_scene, run.table, elements, caches, run.settings.query)
 
 
-def _evaluate(
+def evaluate_run(
     run: RunState, elements: ElementSet, program: QueryProgram, network_ref: UnitRef, test_refs: list[UnitRef]
 ) -> Evaluation:
+    """Scores and times the network of a run against the adversaries on some of the test frames."""
     start = time.perf_counter()
     torch.set_num_threads(dr.thread_count())
     network, encoding = load_network(run, network_ref)

@@ -50,7 +50,9 @@ def _render_frame(run: RunState, ref: UnitRef, camera: Camera, spp: int) -> None
     albedo = normal = np.zeros_like(total, np.float32)
     non_finite = 0
     for index in range(passes):
-        image = trace(run.scene, camera, per_pass, (seed + index * 1_000_003) % 2**32, features=index == 0)
+        pass_seed = (seed + index * 1_000_003) % 2**32
+        image = trace(run.scene, camera, per_pass, pass_seed, features=index == 0,
+                      between_launches=run.progress.between_passes)  # fmt: skip
         finite = np.isfinite(image.radiance).all(axis=2, keepdims=True)
         non_finite += int(finite.size - finite.sum())
         radiance = np.where(finite, image.radiance, 0.0).astype(np.float64)

@@ -1,6 +1,7 @@
 """Stage `train`: fits the reconstruction network of one scene; resumes exactly from its checkpoint."""
 
 import dataclasses
+import os
 import time
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -17,7 +18,7 @@ from models.transfer import Transfer
 from storage.perceptual_weights import find_stlpips
 from storage.store import UnitRef
 from storage.weights import decode_checkpoint, decode_network, encode_checkpoint, encode_network
-from workers.errors import WorkerError
+from workers.errors import StoppedError, WorkerError
 from workers.inputs import load_inputs
 from workers.query import CHANNELS, NUM_CHANNELS
 from workers.reconstruct import GBUFFER_CHANNELS, Encoding, FrameModule, channels_last, pad_to_multiple
@@ -28,7 +29,7 @@ from workers.schedule import learning_rate
 STAGE = "train"
 CHECKPOINT_STAGE = "checkpoint"
 WEIGHTS_FILE, CONFIG_FILE, CHECKPOINT_FILE = "network.safetensors", "network.json", "checkpoint.pt"
-CHECKPOINT_SECONDS = 60.0
+CHECKPOINT_SECONDS = float(os.environ.get("LIGHTWELL_CHECKPOINT_SECONDS", "60"))
 VALIDATIONS = 20
 PROBE_STEPS = 8
 
@@ -76,6 +77,7 @@ def run_train(run: RunState, train: tuple[list[UnitRef], list[UnitRef]],
     """Trains unless the store has the network; both arguments are (input units, render units)."""
     ref = train_ref(run, *train)
     if run.store.committed(ref) is not None:
+        discard_checkpoints(run, ref)  # of a process that ended between the commit and this line
         return ref
     start = time.perf_counter()
     trainer = Trainer(run, ref, load_dataset(run, *train), load_dataset(run, *validation) if validation[0] else None)
@@ -190,7 +192,11 @@ class Trainer:
                 if self.step % every == 0 or self.step == self.num_steps:
                     self._validate()
                 last = self.curve[-1].get("psnr")
-                advance(1, f"loss {terms['total']:.4f}" + (f", validation {last:.2f} dB" if last else ""))
+                try:
+                    advance(1, f"loss {terms['total']:.4f}" + (f", validation {last:.2f} dB" if last else ""))
+                except StoppedError:
+                    self.save_checkpoint()
+                    raise
                 if time.perf_counter() - saved > CHECKPOINT_SECONDS:
                     self.save_checkpoint()
                     saved = time.perf_counter()

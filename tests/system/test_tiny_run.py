@@ -12,7 +12,7 @@ from service.app import create_app
 from storage.caches import CacheSet
 from storage.frames import decode_frame
 from storage.store import Store
-from workers.bake import bake_refs, run_bake
+from workers.bake import bake_refs, bake_units, run_bake
 from workers.element_stage import run_elements
 from workers.pipeline import evaluate_scene, run_scene
 from workers.progress import Progress
@@ -94,10 +94,8 @@ def test_bake_of_a_lost_unit_is_bit_identical(prepared, scene, settings):
 
 
 def _rebake(run, elements, ref):
-    from workers.bake import _bake_lobe, _lobes
-
-    lobe = next(lobe for lobe in _lobes(run, elements) if run.ref("bake", lobe.params) == ref)
-    _bake_lobe(run, lobe, ref)
+    name = next(name for name, found in bake_refs(run, elements).items() if found == ref)
+    bake_units(run, elements, name, range(1))
 
 
 def test_trainer_resumes_with_the_identical_next_loss(prepared, scene, settings, tmp_path):
