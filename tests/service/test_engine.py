@@ -74,8 +74,8 @@ def test_job_run_again_computes_no_stored_unit(runner: DaskRunner, tmp_path: Pat
 
 @pytest.mark.parametrize(
     ("stages", "expected"),
-    [(("bake",), {"elements", "bake", "seal"}), (("render",), {"elements", "bake", "seal", "render"}),
-     (("bake", "train"), {"elements", "bake", "seal", "render", "inputs", "train"})],
+    [(("bake",), {"elements", "bake", "seal"}), (("bake", "render"), {"elements", "bake", "seal", "render"}),
+     (("bake", "render", "train"), {"elements", "bake", "seal", "render", "inputs", "train"})],
 )  # fmt: skip
 def test_job_runs_only_the_stages_asked_for(
     runner: DaskRunner, tmp_path: Path, stages: tuple[str, ...], expected: set[str]
