@@ -37,7 +37,7 @@ class ThreadPolicy:
         """Variables that a process must have before it imports torch or Dr.Jit."""
         threads = str(self.wide)
         return {VARIABLE: f"{self.narrow},{self.wide}", "OMP_NUM_THREADS": threads, "MKL_NUM_THREADS": threads,
-                "OPENBLAS_NUM_THREADS": str(self.narrow), "OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "0",
+                "OPENBLAS_NUM_THREADS": str(self.narrow), "OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "10000",
                 "MPLBACKEND": "Agg"}  # fmt: skip
 
     @classmethod
