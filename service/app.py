@@ -3,9 +3,10 @@
     GET  /v1/scenes                  what can be served
     POST /v1/scenes/{scene}/frame    a frame for a camera, as PNG, JPEG or EXR by Accept
     GET  /healthz                    the process answers
+    /v1/bundles                      uploaded scenes (service/routes_bundles.py)
 
 Errors are problem documents (service/problems.py). Frames are rendered one after the other on one thread
-(service/rendering.py); bounds on the queue, jobs and authentication are not here yet, so listen on loopback.
+(service/rendering.py). Who may ask and how much is in service/auth.py and service/request_limits.py.
 """
 
 import asyncio
@@ -18,9 +19,18 @@ from typing import Annotated, Any
 from fastapi import FastAPI, Header, Response
 
 from service import images
+from service.auth import add_access_control
+from service.bundle_archive import ArchiveLimits
+from service.bundle_rules import SceneLimits
+from service.bundles import BundleStore
+from service.config import ServiceConfig
 from service.problems import PROBLEM, add_problem_handlers
+from service.redaction import register_secrets
 from service.rendering import Backend, RenderThread, StoreBackend
+from service.request_limits import add_body_limit
+from service.routes_bundles import FORM_OVERHEAD_NBYTES, UPLOAD_PATH, add_bundle_routes
 from service.schemas import DEFAULT_MAX_PIXELS, FrameRequest
+from service.serving import is_loopback
 
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 _PROBLEM_OF_STATUS = {
@@ -59,6 +69,7 @@ def create_app(
     *,
     make_backend: Callable[[], Backend] | None = None,
     max_pixels: int = DEFAULT_MAX_PIXELS,
+    config: ServiceConfig | None = None,
 ) -> FastAPI:
     """The service over one store.
 
@@ -66,7 +77,10 @@ def create_app(
         store_url: a folder or fsspec URL that holds a store.
         make_backend: what opens scenes instead of the store; called on the render thread.
         max_pixels: the largest frame that is answered.
+        config: adds bundles, access control and limits of request bodies (and decides `max_pixels`).
     """
+    if config is not None:
+        max_pixels = config.max_pixels
     rendering = RenderThread(make_backend or (lambda: StoreBackend(store_url)))
 
     @asynccontextmanager
@@ -118,4 +132,30 @@ def create_app(
             },
         )
 
+    if config is not None:
+        _add_configured(app, config)
     return app
+
+
+def _add_configured(app: FastAPI, config: ServiceConfig) -> None:
+    """Bundles, then what stands before every route: limits, and outermost who may ask."""
+    register_secrets(config.secrets())
+    add_bundle_routes(app, bundle_store(config), config.upload_max_nbytes)
+    add_body_limit(
+        app, config.body_max_nbytes, {UPLOAD_PATH: config.upload_max_nbytes + FORM_OVERHEAD_NBYTES}
+    )  # fmt: skip
+    token = config.token.get_secret_value() if config.token is not None else None
+    add_access_control(app, token, local_only=is_loopback(config.host))
+
+
+def bundle_store(config: ServiceConfig) -> BundleStore:
+    """The uploaded bundles of a configuration."""
+    return BundleStore(
+        config.bundles_path,
+        ArchiveLimits(
+            max_nbytes=config.upload_max_unpacked_nbytes,
+            max_files=config.upload_max_files,
+            max_ratio=config.upload_max_ratio,
+        ),
+        SceneLimits(max_pixels=config.max_pixels, max_spp=config.max_spp, max_depth=config.max_depth),
+    )

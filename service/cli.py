@@ -252,14 +252,21 @@ def frame(
 @app.command()
 def serve(
     store: StoreOption,
-    host: Annotated[str, typer.Option("--host", help="address to listen on")] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0 takes a free one")] = 8000,
+    host: Annotated[str | None, typer.Option("--host", help="address to listen on; default: 127.0.0.1")] = None,
+    port: Annotated[int | None, typer.Option("--port", min=0, max=65535, help="default: 8000; 0: a free one")] = None,
+    allow_unauthenticated: Annotated[
+        bool, typer.Option("--allow-unauthenticated", help="let others in without LIGHTWELL_TOKEN")
+    ] = False,
+    scenes: Annotated[Path | None, typer.Option("--scenes", help="folder of scenes that clients may name")] = None,
 ) -> None:
-    """Answer frame requests over HTTP: POST /v1/scenes/{scene}/frame, GET /v1/scenes, /docs."""
+    """Answer over HTTP: POST /v1/scenes/{scene}/frame, POST /v1/bundles, /docs. Also reads LIGHTWELL_* variables."""
     with reported():
+        from service.config import load_config
         from service.serving import serve_store
 
-        serve_store(store, host, port)
+        config = load_config(store_url=store, host=host, port=port, scenes_folder=scenes,
+                             allow_unauthenticated=allow_unauthenticated or None)  # fmt: skip
+        serve_store(config)
 
 
 def main() -> None:

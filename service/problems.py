@@ -11,6 +11,7 @@ from starlette.exceptions import HTTPException
 
 from models.errors import ModelError
 from service import errors
+from service.redaction import redact
 from storage.errors import StorageError
 from workers.errors import CameraError, WorkerError
 
@@ -21,8 +22,14 @@ STATUS_OF_ERROR: dict[type[Exception], int] = {
     errors.UnknownSceneError: 404,
     errors.NotAcceptableError: 406,
     errors.AmbiguousSceneError: 409,
+    errors.UnknownBundleError: 404,
+    errors.BundleInUseError: 409,
     errors.FrameTooLargeError: 413,
+    errors.BundleTooLargeError: 413,
+    errors.UnsupportedUploadError: 415,
+    errors.BundleError: 422,
     CameraError: 422,
+    errors.BundleStorageError: 507,
     errors.ServiceError: 500,
     WorkerError: 500,
     StorageError: 500,
@@ -34,7 +41,7 @@ STATUS_OF_ERROR: dict[type[Exception], int] = {
 
 def problem(status: int, detail: str, **extra: Any) -> JSONResponse:
     """A problem document; `title` is the status' own phrase, so `type` is about:blank and left out."""
-    content = {"title": HTTPStatus(status).phrase, "status": status, "detail": detail, **extra}
+    content = {"title": HTTPStatus(status).phrase, "status": status, "detail": redact(detail), **extra}
     return JSONResponse(content, status_code=status, media_type=PROBLEM)
 
 
@@ -43,7 +50,7 @@ def _known_error(_: Request, error: Exception) -> JSONResponse:
     detail = " ".join(str(error).split()) or "not enough memory for this frame; choose a smaller size"
     if status >= 500:
         log.error("%s: %s", type(error).__name__, detail)
-    return problem(status, detail)
+    return problem(status, detail, **getattr(error, "members", {}))
 
 
 def _invalid_request(_: Request, error: Exception) -> JSONResponse:

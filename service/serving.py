@@ -3,8 +3,12 @@
 import ipaddress
 import socket
 import sys
+from typing import TYPE_CHECKING
 
 from service.errors import OptionError
+
+if TYPE_CHECKING:
+    from service.config import ServiceConfig
 
 
 def is_loopback(host: str) -> bool:
@@ -31,26 +35,29 @@ def bind(host: str, port: int) -> socket.socket:
         ) from None
 
 
-def serve_store(store_url: str, host: str, port: int) -> None:
+def serve_store(config: "ServiceConfig") -> None:
     """Serves until it is interrupted.
 
     Raises:
+        AccessError: others could reach it and nothing asks for a token.
         StorageError: there is no store at the URL.
         OptionError: the address cannot be had.
     """
     import uvicorn
 
     from service.app import create_app
+    from service.redaction import redact, redact_logs
     from storage.store import Store
 
-    Store.open(store_url)
-    with bind(host, port) as listener:
-        url = f"http://{f'[{host}]' if ':' in host else host}:{listener.getsockname()[1]}"
-        if not is_loopback(host):
-            print(
-                f"lightwell: {host} can be reached from outside and nothing asks for a password",
-                file=sys.stderr,
-            )
-        print(f"serving {store_url} on {url} (API: {url}/docs)", file=sys.stderr)
-        server = uvicorn.Server(uvicorn.Config(create_app(store_url), log_level="info"))
-        server.run(sockets=[listener])
+    warning = config.check_exposure()
+    Store.open(config.store_url)
+    with bind(config.host, config.port) as listener:
+        app = create_app(config.store_url, config=config)
+        server_config = uvicorn.Config(app, log_level="info", server_header=False)
+        redact_logs()  # uvicorn has just made its handlers
+        host = f"[{config.host}]" if ":" in config.host else config.host
+        url = f"http://{host}:{listener.getsockname()[1]}"
+        if warning is not None:
+            print(f"lightwell: {warning}", file=sys.stderr)
+        print(f"serving {redact(config.store_url)} on {url} (API: {url}/docs)", file=sys.stderr)
+        uvicorn.Server(server_config).run(sockets=[listener])
