@@ -1,8 +1,8 @@
 """The HTTP service: frames of the scenes of one store, and how it fares.
 
 Routes are in service/routes_*.py; errors are problem documents (service/problems.py). Frames are rendered one
-after the other on one thread (service/rendering.py); jobs run beside them (service/jobs). Authentication is not
-here: listen on loopback.
+after the other on one thread (service/rendering.py); jobs run beside them (service/jobs). Who may ask, and how much, is
+in service/auth.py and service/request_limits.py.
 """
 
 import asyncio
@@ -13,15 +13,24 @@ from typing import TYPE_CHECKING
 
 from fastapi import FastAPI
 
+from service.auth import add_access_control
+from service.bundle_archive import ArchiveLimits
+from service.bundle_rules import SceneLimits
+from service.bundles import BundleStore
+from service.config import ServiceConfig
 from service.failures import known_errors, one_line
-from service.metrics import FrameMetrics
+from service.metrics import FrameMetrics, job_metrics
 from service.pictures import DEFAULT_QUEUE_LIMIT, DEFAULT_RECENT_NBYTES, Pictures
 from service.problems import add_problem_handlers
+from service.redaction import register_secrets
 from service.rendering import Backend, RenderThread, StoreBackend
+from service.request_limits import add_body_limit
+from service.routes_bundles import FORM_OVERHEAD_NBYTES, UPLOAD_PATH, add_bundle_routes
 from service.routes_frames import add_frame_routes
 from service.routes_health import Readiness, add_health_routes
 from service.scene_cache import DEFAULT_MEMORY_NBYTES
 from service.schemas import DEFAULT_MAX_PIXELS
+from service.serving import is_loopback
 from service.version import package_version
 
 if TYPE_CHECKING:
@@ -42,6 +51,7 @@ def create_app(
     memory_nbytes: int = DEFAULT_MEMORY_NBYTES,
     recent_nbytes: int = DEFAULT_RECENT_NBYTES,
     preload: Sequence[str] = (),
+    config: ServiceConfig | None = None,
 ) -> FastAPI:
     """The service over one store.
 
@@ -54,10 +64,14 @@ def create_app(
         memory_nbytes: of all open scenes together.
         recent_nbytes: of pictures kept to be sent again.
         preload: scenes opened before the service is ready.
+        config: adds bundles, access control and limits of request bodies, and decides `max_pixels`, `queue_limit` and
+            `memory_nbytes`.
 
     Returns:
         The app; `app.state` has `registry` (of /metrics), `readiness` and `pictures`.
     """
+    if config is not None:
+        max_pixels, queue_limit, memory_nbytes = config.max_pixels, config.queue_limit, config.memory_limit
     rendering = RenderThread(
         make_backend or (lambda: StoreBackend(store_url)), budget_nbytes=memory_nbytes, preload=preload
     )
@@ -99,6 +113,9 @@ def create_app(
         from service.routes_jobs import add_job_routes
 
         add_job_routes(app, jobs)
+        job_metrics(metrics.registry, lambda: {state.value: n for state, n in jobs.table.counts().items()})
+    if config is not None:
+        _add_configured(app, config, jobs)
     return app
 
 
@@ -111,3 +128,28 @@ async def _warm_up(rendering: RenderThread, readiness: Readiness) -> None:
         readiness.failed(f"the warm-up failed: {one_line(error)}")
     else:
         readiness.ready()
+
+
+def _add_configured(app: FastAPI, config: ServiceConfig, jobs: "Jobs | None") -> None:
+    """Bundles, then what stands before every route: limits, and outermost who may ask."""
+    register_secrets(config.secrets())
+    in_use = (lambda bundle_id: jobs.uses(bundle_id)) if jobs is not None else (lambda bundle_id: False)
+    add_bundle_routes(app, bundle_store(config), config.upload_max_nbytes, in_use)
+    add_body_limit(
+        app, config.body_max_nbytes, {UPLOAD_PATH: config.upload_max_nbytes + FORM_OVERHEAD_NBYTES}
+    )  # fmt: skip
+    token = config.token.get_secret_value() if config.token is not None else None
+    add_access_control(app, token, local_only=is_loopback(config.host))
+
+
+def bundle_store(config: ServiceConfig) -> BundleStore:
+    """The uploaded bundles of a configuration."""
+    return BundleStore(
+        config.bundles_path,
+        ArchiveLimits(
+            max_nbytes=config.upload_max_unpacked_nbytes,
+            max_files=config.upload_max_files,
+            max_ratio=config.upload_max_ratio,
+        ),
+        SceneLimits(max_pixels=config.max_pixels, max_spp=config.max_spp, max_depth=config.max_depth),
+    )

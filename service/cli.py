@@ -260,18 +260,29 @@ def frame(
 @app.command()
 def serve(
     store: StoreOption,
-    host: Annotated[str, typer.Option("--host", help="address to listen on")] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0 takes a free one")] = 8000,
+    host: Annotated[str | None, typer.Option("--host", help="address to listen on; default: 127.0.0.1")] = None,
+    port: Annotated[int | None, typer.Option("--port", min=0, max=65535, help="default: 8000; 0: a free one")] = None,
+    allow_unauthenticated: Annotated[
+        bool, typer.Option("--allow-unauthenticated", help="let others in without LIGHTWELL_TOKEN")
+    ] = False,
+    scenes: Annotated[Path | None, typer.Option("--scenes", help="folder of scenes that clients may name")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option("--scheduler", help="address of a Dask scheduler; default: a cluster of its own")
+    ] = None,
+    num_workers: Annotated[int | None, typer.Option("--workers", min=1, help="processes of the own cluster")] = None,
     preload: Annotated[
         list[str] | None,
         typer.Option("--preload", help="open this scene before /readyz says ready; may be given again"),
     ] = None,
 ) -> None:
-    """Run jobs and answer frame requests over HTTP: POST /v1/jobs, POST /v1/scenes/{scene}/frame, /metrics, /docs."""
+    """Run jobs and answer frame requests over HTTP; /docs describes it. Also reads LIGHTWELL_* variables."""
     with reported():
+        from service.config import load_config
         from service.serving import serve_store
 
-        serve_store(store, host, port, preload or ())
+        config = load_config(store_url=store, host=host, port=port, scenes_folder=scenes, scheduler=scheduler,
+                             workers=num_workers, allow_unauthenticated=allow_unauthenticated or None)  # fmt: skip
+        serve_store(config, preload or ())
 
 
 app.command()(verify)

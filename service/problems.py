@@ -12,6 +12,7 @@ from starlette.exceptions import HTTPException
 
 from models.errors import ModelError
 from service import errors
+from service.redaction import redact
 from storage.errors import StorageError
 from workers.errors import CameraError, SceneError, WorkerError
 from workers.job_spec import JobSpecError
@@ -42,6 +43,12 @@ STATUS_OF_ERROR: dict[type[Exception], int] = {
     errors.NonFiniteFrameError: 500,
     errors.BusyError: 503,
     errors.SceneTooLargeError: 507,
+    errors.UnknownBundleError: 404,
+    errors.BundleInUseError: 409,
+    errors.BundleTooLargeError: 413,
+    errors.UnsupportedUploadError: 415,
+    errors.BundleError: 422,
+    errors.BundleStorageError: 507,
     errors.ServiceError: 500,
     WorkerError: 500,
     StorageError: 500,
@@ -72,7 +79,7 @@ def problem_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
 def problem(status: int, detail: str, **extra: Any) -> JSONResponse:
     """A problem document; `title` is the status' own phrase, so `type` is about:blank and left out."""
     title = HTTPStatus(status).phrase if status != CLIENT_GONE else "Client Closed Request"
-    content = {"title": title, "status": status, "detail": detail, **extra}
+    content = {"title": title, "status": status, "detail": redact(detail), **extra}
     return JSONResponse(content, status_code=status, media_type=PROBLEM)
 
 
@@ -90,6 +97,7 @@ def _known_error(_: Request, error: Exception) -> JSONResponse:
     if status >= 500 and not is_busy:
         log.error("%s: %s", type(error).__name__, detail)
     extra = {"non_finite": error.non_finite} if isinstance(error, errors.NonFiniteFrameError) else {}
+    extra |= getattr(error, "members", {})
     response = problem(status, detail, **extra)
     if status == HTTPStatus.SERVICE_UNAVAILABLE:
         wait_s = error.retry_after_s if isinstance(error, errors.BusyError) else RETRY_AFTER_S

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     import uvicorn
     from fastapi import FastAPI
 
+    from service.config import ServiceConfig
+    from service.jobs.service import Jobs
+
 GRACE_S = 10
 
 
@@ -45,42 +48,50 @@ def bind(host: str, port: int) -> socket.socket:
     return listener
 
 
-def serve_store(
-    store_url: str, host: str, port: int, preload: Sequence[str] = (), *, database_url: str | None = None
-) -> None:
+def serve_store(config: "ServiceConfig", preload: Sequence[str] = ()) -> None:
     """Serves until it is interrupted.
 
     Args:
-        store_url: a folder or fsspec URL; a new store is made where there is none, for jobs to fill.
-        host: address to listen on.
-        port: 0 takes a free one.
+        config: a new store is made where there is none, for jobs to fill.
         preload: scenes that are opened before the service says that it is ready.
-        database_url: where jobs are kept; None: an SQLite file in the store's folder.
 
     Raises:
+        AccessError: others could reach it and nothing asks for a token.
+        SchedulerError: no scheduler answers at the address.
         StorageError: the store cannot be opened or made.
         OptionError: the address cannot be had.
         JobDatabaseError: the job database cannot be used.
     """
     from service.app import create_app
-    from service.jobs.service import Jobs
-    from service.jobs.submission import Desk
-    from service.local_runner import LocalRunner
-    from service.scene_names import resolve_builtin_scene
+    from service.redaction import redact, redact_logs
     from storage.store import Store
 
-    Store.open(store_url, create=True)
-    with bind(host, port) as listener:
-        url = f"http://{f'[{host}]' if ':' in host else host}:{listener.getsockname()[1]}"
-        if not is_loopback(host):
-            print(
-                f"lightwell: {host} can be reached from outside and nothing asks for a password",
-                file=sys.stderr,
-            )
-        print(f"serving {store_url} on {url} (API: {url}/docs)", file=sys.stderr)
-        desk = Desk(resolve_scene_source=resolve_builtin_scene)
-        jobs = Jobs.of_store(store_url, LocalRunner(store_url), desk, database_url)
-        make_server(create_app(store_url, preload=preload, jobs=jobs)).run(sockets=[listener])
+    warning = config.check_exposure()
+    Store.open(config.store_url, create=True)
+    with bind(config.host, config.port) as listener:
+        jobs = _jobs(config)
+        server = make_server(create_app(config.store_url, config=config, jobs=jobs, preload=preload))
+        redact_logs()  # uvicorn has just made its handlers
+        host = f"[{config.host}]" if ":" in config.host else config.host
+        url = f"http://{host}:{listener.getsockname()[1]}"
+        if warning is not None:
+            print(f"lightwell: {warning}", file=sys.stderr)
+        print(f"serving {redact(config.store_url)} on {url} (API: {url}/docs)", file=sys.stderr)
+        server.run(sockets=[listener])
+
+
+def _jobs(config: "ServiceConfig") -> "Jobs":
+    """Jobs of the store, run by Dask workers: an own cluster's, or those of the scheduler that is named."""
+    from service.app import bundle_store
+    from service.engine import DaskRunner
+    from service.jobs.service import Jobs
+    from service.jobs.submission import Desk
+    from service.scene_sources import SceneSources
+
+    sources = SceneSources(bundle_store(config), config.scenes_folder)
+    desk = Desk(resolve_scene_source=sources.resolve_scene_source, max_pixels=config.max_pixels, max_spp=config.max_spp)
+    runner = DaskRunner(config.store_url, config.scheduler, config.workers)
+    return Jobs.of_store(config.store_url, runner, desk, config.database_url)
 
 
 def make_server(app: "FastAPI", log_level: str = "info") -> "uvicorn.Server":
@@ -95,4 +106,4 @@ def make_server(app: "FastAPI", log_level: str = "info") -> "uvicorn.Server":
             app.state.readiness.stopping()
             super().handle_exit(sig, frame)
 
-    return Server(uvicorn.Config(app, log_level=log_level, timeout_graceful_shutdown=GRACE_S))
+    return Server(uvicorn.Config(app, log_level=log_level, timeout_graceful_shutdown=GRACE_S, server_header=False))

@@ -4,9 +4,12 @@ from service.job_runner import JobRunner
 from service.jobs.database import Database, default_url
 from service.jobs.dispatcher import Dispatcher
 from service.jobs.planner import Planner
+from service.jobs.states import TERMINAL, State
 from service.jobs.stream import HEARTBEAT_S
 from service.jobs.submission import Desk
 from service.jobs.table import JobTable
+
+MAX_UNFINISHED = 10_000  # jobs looked at for a bundle that is to be deleted
 
 
 class Jobs:
@@ -44,6 +47,12 @@ class Jobs:
     def of_store(cls, store_url: str, runner: JobRunner, desk: Desk, database_url: str | None = None) -> "Jobs":
         """The jobs of a store: in the database that is given, else in an SQLite file beside its units."""
         return cls(database_url or default_url(store_url), runner, desk)
+
+    def uses(self, bundle_id: str) -> bool:
+        """Whether a job that is not over names the bundle."""
+        unfinished = [state for state in State if state not in TERMINAL]
+        jobs = self.table.page(states=unfinished, limit=MAX_UNFINISHED)
+        return any(str(job.request.get("scene", "")).startswith(f"bundle:{bundle_id}") for job in jobs)
 
     def start(self) -> None:
         """Resumes what was left unfinished, and runs what is queued."""
