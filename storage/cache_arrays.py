@@ -117,7 +117,7 @@ def open_array(group: zarr.Group, name: str) -> zarr.Array:
 
 
 def arrays_of(files: FileTree, folder: str, group: zarr.Group) -> list[zarr.Array]:
-    """Arrays of a group by name. What a bake left when it died (a folder without metadata) or another group is passed over."""
+    """Arrays of a group by name; folders without metadata, which a killed bake leaves, and groups are passed over."""
     names = [name for name in files.names(folder) if name != METADATA and not layout.is_partial(name)]
     found = []
     for name in names:
