@@ -3,6 +3,7 @@
 Chunks are compressed and carry a CRC32C. One chunk is one bake unit, so a unit has one writer and no locks.
 """
 
+import contextlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -113,6 +114,16 @@ def open_array(group: zarr.Group, name: str) -> zarr.Array:
     if not isinstance(array, zarr.Array):
         raise CacheMismatchError(f"{name} must be an array, got a group; use another array name")
     return array.with_config({"write_empty_chunks": True})
+
+
+def arrays_of(files: FileTree, folder: str, group: zarr.Group) -> list[zarr.Array]:
+    """Arrays of a group by name; folders without metadata, which a killed bake leaves, and groups are passed over."""
+    names = [name for name in files.names(folder) if name != METADATA and not layout.is_partial(name)]
+    found = []
+    for name in names:
+        with contextlib.suppress(KeyError):
+            found.append(group[name])
+    return [array for array in found if isinstance(array, zarr.Array)]
 
 
 def spec_of(array: zarr.Array) -> ArraySpec:

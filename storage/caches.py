@@ -83,7 +83,7 @@ class CacheSet:
                 raise store.damage(ref, f"{ref.folder}/{name}", problem)
         with _opening(store, ref):
             group = cache_arrays.open_group(store.files, folder)
-            specs = [cache_arrays.spec_of(array) for _, array in sorted(group.arrays())]
+            specs = [cache_arrays.spec_of(array) for array in cache_arrays.arrays_of(store.files, folder, group)]
         if not specs:  # a bake died between making the group and its first array
             raise MissingUnitError(
                 f"cache set {ref} must hold arrays in store {store.url}, got none in {store.files.path(folder)}; "

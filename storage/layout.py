@@ -78,10 +78,6 @@ def unit_marker(folder: str) -> str:
     return f"{folder}/{MARKER}"
 
 
-def unit_file(folder: str, name: str) -> str:
-    return f"{folder}/{file_name(name)}"
-
-
 def array_name(name: str) -> str:
     """Checks the name of a cache array."""
     return _segment("array name", name)

@@ -17,6 +17,7 @@ from storage import refusals
 from storage.errors import StoreUrlError
 
 _S3 = ("s3", "s3a")
+_WITHOUT_FOLDERS = {*_S3, "gs", "gcs", "az", "abfs"}
 _S3_OPTIONS = {
     # 1: a read is one GET; s3fs would ask for the size first, to read large objects in parts.
     "max_concurrency": 1,
@@ -62,9 +63,9 @@ def is_local(filesystem: AbstractFileSystem) -> bool:
 
 
 def has_folders(filesystem: AbstractFileSystem) -> bool:
-    """Whether a folder must be made before a file is put into it. In S3 that would make the bucket."""
+    """Whether a folder must be made before a file is put into it. In an object store that would make the bucket."""
     protocol = filesystem.protocol
-    return not set(_S3) & set([protocol] if isinstance(protocol, str) else protocol)
+    return not _WITHOUT_FOLDERS & set([protocol] if isinstance(protocol, str) else protocol)
 
 
 def put_new(filesystem: AbstractFileSystem, path: str, data: bytes) -> bool:
