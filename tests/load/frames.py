@@ -183,7 +183,8 @@ def measure(options: argparse.Namespace, store: str) -> dict[str, Any]:
         metrics = httpx.get(f"{url}/metrics", trust_env=False).text
     base, one, many = bare.summary(), alone.summary(alone_cpu_s), load.summary(load_cpu_s)
     return {
-        "clients": options.clients, "widths": options.widths, "seconds": options.seconds, "size": options.size, "accept": options.accept,
+        "clients": options.clients, "widths": options.widths,
+        "seconds": options.seconds, "size": options.size, "accept": options.accept,
         "bake_beside": options.bake, "bare": base, "one_client": one, "all_clients": many,
         "overhead_p50": {
             "latency_of_one_client": round(one["p50_ms"] / base["p50_ms"] - 1.0, 4),
