@@ -37,6 +37,8 @@ from tests.load.store import SCENES
 MAX_GROWTH = 0.05
 SETTLED_S = 60.0
 """Memory counts from here on: the first minute sees every size, scene and cache for the first time."""
+WIDTHS = "32,48,64"
+"""The network of every preset but `tiny`: what users serve."""
 WARM_S, TURN_S = 4.0, 5.0
 METRICS = re.compile(r"lightwell_(frames|renders|queue|open|scenes|non_finite)\w*(?<!_created)[ {]|process_resident")
 POSES_A_PHASE = 1_000_000
@@ -94,7 +96,6 @@ class Load:
             "answers": dict(self.kinds),
             **quantiles_ms(self.latencies_s),
             "between_answers_p50_ms": round(1e3 * float(np.median(np.diff(sorted(self.answered_s)))), 3),
-            "between_answers_mean_ms": round(1e3 * float(np.mean(np.diff(sorted(self.answered_s)))), 3),
             "cpu_ms_a_frame": round(1e3 * cpu_s / len(self.answered_s), 2),
             "steps_p50_ms": {name: round(float(np.median(values)), 3) for name, values in self.steps_ms.items()},
         }
@@ -182,7 +183,8 @@ def measure(options: argparse.Namespace, store: str) -> dict[str, Any]:
         metrics = httpx.get(f"{url}/metrics", trust_env=False).text
     base, one, many = bare.summary(), alone.summary(alone_cpu_s), load.summary(load_cpu_s)
     return {
-        "clients": options.clients, "seconds": options.seconds, "size": options.size, "accept": options.accept,
+        "clients": options.clients, "widths": options.widths,
+        "seconds": options.seconds, "size": options.size, "accept": options.accept,
         "bake_beside": options.bake, "bare": base, "one_client": one, "all_clients": many,
         "overhead_p50": {
             "latency_of_one_client": round(one["p50_ms"] / base["p50_ms"] - 1.0, 4),
@@ -214,12 +216,13 @@ def main() -> int:
     parser.add_argument("--accept", default="image/png", choices=("image/png", "image/jpeg", "image/x-exr"))
     parser.add_argument("--rounds", type=int, default=4, help="turns of bare renderer and one client")
     parser.add_argument("--store", help="made there if it is not; default: a temporary folder")
+    parser.add_argument("--widths", default=WIDTHS, help="of the networks that are trained for a new store")
     parser.add_argument("--bake", action="store_true", help="bake in another process meanwhile")
     parser.add_argument("--json", type=Path, help="also write the figures here")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         store = options.store or folder
-        subprocess.run([sys.executable, "-m", "tests.load.store", store], check=True)
+        subprocess.run([sys.executable, "-m", "tests.load.store", store, options.widths], check=True)
         figures = measure(options, store)
     text = json.dumps(figures, indent=1)
     print(text)

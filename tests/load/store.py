@@ -11,9 +11,15 @@ from workers.settings import Settings
 SCENES = {"tiny": "tiny", "alcove": str(Path(__file__).with_name("alcove.yaml"))}
 
 
-def prepare(url: str) -> None:
-    """Runs the scenes with the `tiny` preset; what the store has of them is kept (some 15 s the first time)."""
-    store, settings = Store.open(url, create=True), Settings.preset_named("tiny")
+def prepare(url: str, widths: str = "") -> None:
+    """Runs the scenes with the `tiny` preset; what the store has of them is kept (some 15 s the first time).
+
+    Args:
+        url: of the store.
+        widths: of the network, such as "32,48,64"; default: the `tiny` preset's narrow one.
+    """
+    settings = Settings.preset_named("tiny").override({"train.widths": widths} if widths else {})
+    store = Store.open(url, create=True)
     served = {entry["name"] for entry in store.scenes() if "network" in entry}
     for name in SCENES.keys() - served:
         scene = load_scene(SCENES[name], width=settings.width, height=settings.height)
@@ -23,4 +29,4 @@ def prepare(url: str) -> None:
 if __name__ == "__main__":
     import sys
 
-    prepare(sys.argv[1])
+    prepare(*sys.argv[1:])
