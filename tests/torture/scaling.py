@@ -19,8 +19,8 @@ UNIT_SECONDS = 10.0
 NUM_UNITS = 4
 WARM = {"cache.max_elements": 6000, "cache.elements_per_unit": 128, "frames.num_train": 8, "frames.num_test": 1,
         "cache.diffuse_spp": 65, "frames.train_spp": 33, "frames.test_spp": 65}  # fmt: skip
-WORK = {**WARM, "cache.diffuse_spp": 4096, "cache.directional_spp": 64, "frames.train_spp": 1024,
-        "frames.test_spp": 1024}  # fmt: skip
+WORK = {**WARM, "cache.diffuse_spp": 1024, "cache.directional_spp": 16, "frames.train_spp": 256,
+        "frames.test_spp": 256}  # fmt: skip
 
 
 def timed(runner: DaskRunner, spec: JobSpec) -> tuple[float, dict[str, float], dict[str, Any]]:
