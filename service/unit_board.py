@@ -222,7 +222,7 @@ class UnitBoard:
         if entry is None:
             return
         if event["kind"] == "began":
-            entry.worker, entry.address = event["worker"], event["address"]
+            entry.worker, entry.address = event["name"], event["address"]
         elif event["kind"] == "progress":
             values = {name: event[name] for name in ("done", "total", "note")}
             entry.tell(Outcome(entry.identity, "progress", **values))
