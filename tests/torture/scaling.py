@@ -19,7 +19,7 @@ from workers.thread_policy import ThreadPolicy
 UNIT_SECONDS = 10.0
 NUM_UNITS = 4
 # Units of a second or more, as real ones are: below that, what counts is the flush of each file to the disk.
-WORK = {"cache.max_elements": 4000, "cache.elements_per_unit": 128, "cache.diffuse_spp": 8192,
+WORK = {"cache.max_elements": 6500, "cache.elements_per_unit": 128, "cache.diffuse_spp": 8192,
         "cache.directional_spp": 256, "frames.num_train": 8, "frames.num_test": 1, "frames.train_spp": 512,
         "frames.test_spp": 512}  # fmt: skip
 # The same kernels on other elements and frames: each process compiles them for some seconds, once.
