@@ -3,7 +3,6 @@
 import contextlib
 import logging
 import os
-import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -109,8 +108,17 @@ class Cluster:
                 client.close(timeout=1)
 
     def workers(self) -> dict[str, dict[str, Any]]:
-        """Address to {"name", "nthreads", "resources", ...} of each connected worker."""
-        return dict(self.client().scheduler_info()["workers"])
+        """Address to {"name", "nthreads", "resources", ...} of each connected worker.
+
+        Raises:
+            SchedulerError: no scheduler answers.
+        """
+        client = self.client()
+        try:
+            return dict(client.scheduler_info()["workers"])
+        except (OSError, TimeoutError) as error:
+            self.drop_client()
+            raise SchedulerError(f"scheduler must answer at {self._address}, got {type(error).__name__}") from error
 
     def restart_worker(self, address: str) -> None:
         """Replaces a worker's process; nothing happens where it is gone already."""
@@ -137,13 +145,3 @@ def _topic() -> str:
 
 def _allowed_failures(dask_scheduler: Any) -> int:
     return int(dask_scheduler.allowed_failures)
-
-
-def wait_for(condition: Callable[[], bool], timeout_s: float) -> bool:
-    """Whether a condition came true in time."""
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.05)
-    return True

@@ -9,10 +9,10 @@ import logging
 import queue
 import threading
 import time
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from service.cluster import Cluster, SchedulerError
+from service.unit_request import Listener, Outcome, UnitRequest
 from service.unit_task import Executor, Recycling, UnitError, run_unit
 from workers.errors import StoppedError
 from workers.job_spec import JobSpec
@@ -32,56 +32,6 @@ _ANSWERED = ("census", "inventory", "train", "evaluate")  # stages whose answer 
 _GPU_STAGE = "train"
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """News of one unit.
-
-    Attributes:
-        identity: as it was asked for.
-        kind: "done", "set_aside", "retry", "progress" or "message".
-        answer: of a unit that is done, where its stage has one.
-        reason, attempts: of a failure.
-        done, total, note: of progress, in the unit's own steps.
-    """
-
-    identity: str
-    kind: Literal["done", "set_aside", "retry", "progress", "message"]
-    answer: Any = None
-    reason: str = ""
-    attempts: int = 0
-    done: float = 0.0
-    total: float = 0.0
-    note: str = ""
-
-
-class Listener:
-    """One job's queue of outcomes."""
-
-    def __init__(self) -> None:
-        self.outcomes: queue.SimpleQueue[Outcome] = queue.SimpleQueue()
-
-
-@dataclass(eq=False)
-class _Entry:
-    """A unit that somebody wants."""
-
-    identity: str
-    unit: Unit
-    spec: JobSpec
-    listeners: set[Listener]
-    failures: list[str] = field(default_factory=list)
-    failed_on: set[str] = field(default_factory=set)
-    deaths_nearby: int = 0
-    key: str = ""
-    future: "Future | None" = None
-    worker: str | None = None
-    address: str | None = None
-
-    def tell(self, outcome: Outcome) -> None:
-        for listener in list(self.listeners):
-            listener.outcomes.put(outcome)
-
-
 class UnitBoard:
     """Asks a cluster for units on behalf of jobs.
 
@@ -99,9 +49,9 @@ class UnitBoard:
         self._store_url, self._executor, self._recycling = store_url, executor, recycling
         self._inbox: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
         self._lock = threading.Lock()
-        self._entries: dict[str, _Entry] = {}
-        self._keys: dict[str, _Entry] = {}
-        self._waiting: collections.deque[_Entry] = collections.deque()
+        self._entries: dict[str, UnitRequest] = {}
+        self._keys: dict[str, UnitRequest] = {}
+        self._waiting: collections.deque[UnitRequest] = collections.deque()
         self._leaving: dict[str, tuple[str, float]] = {}
         self._connected = True
         self._slots, self._has_gpu = num_workers, False
@@ -125,7 +75,7 @@ class UnitBoard:
             if entry is not None:
                 entry.listeners.add(listener)
                 return
-            entry = self._entries[identity] = _Entry(identity, unit, spec, {listener})
+            entry = self._entries[identity] = UnitRequest(identity, unit, spec, {listener})
         self._inbox.put(("wait", entry))
 
     def withdraw(self, listener: Listener) -> None:
@@ -185,7 +135,7 @@ class UnitBoard:
                 self._submit(entry)
             self._waiting.popleft()
 
-    def _submit(self, entry: _Entry) -> None:
+    def _submit(self, entry: UnitRequest) -> None:
         client = self._cluster.client()
         # The same for every service that wants it, so that one scheduler runs it once; another after each attempt.
         key = f"{entry.identity}#{len(entry.failures) + entry.deaths_nearby}"
@@ -199,7 +149,7 @@ class UnitBoard:
         entry.future = client.submit(run_unit, *arguments, key=key, resources=resources, pure=False, **preferred)
         entry.future.add_done_callback(lambda future: self._inbox.put(("ended", entry, future)))
 
-    def _settle(self, entry: _Entry, future: "Future") -> None:
+    def _settle(self, entry: UnitRequest, future: "Future") -> None:
         """A future has ended one way or another."""
         if future.status == "finished":
             answer = None
@@ -216,7 +166,7 @@ class UnitBoard:
         else:  # cancelled or lost: the scheduler went away
             self._again(entry)
 
-    def _fail(self, entry: _Entry, error: BaseException) -> None:
+    def _fail(self, entry: UnitRequest, error: BaseException) -> None:
         from distributed import KilledWorker
 
         if isinstance(error, StoppedError):  # another service stopped wanting it just as we began to
@@ -243,24 +193,24 @@ class UnitBoard:
         entry.tell(Outcome(entry.identity, "retry", reason=reason, attempts=attempts))
         self._again(entry)
 
-    def _again(self, entry: _Entry) -> None:
+    def _again(self, entry: UnitRequest) -> None:
         self._let_go(entry)
         self._waiting.append(entry)
 
-    def _finish(self, entry: _Entry, outcome: Outcome) -> None:
+    def _finish(self, entry: UnitRequest, outcome: Outcome) -> None:
         with self._lock:
             if self._entries.get(entry.identity) is entry:
                 del self._entries[entry.identity]
             entry.tell(outcome)
         self._let_go(entry)
 
-    def _let_go(self, entry: _Entry) -> None:
+    def _let_go(self, entry: UnitRequest) -> None:
         self._keys.pop(entry.key, None)
         future, entry.future = entry.future, None
         if future is not None:
             future.release()
 
-    def _release(self, entry: _Entry) -> None:
+    def _release(self, entry: UnitRequest) -> None:
         if entry.future is not None and entry.address is not None:
             self._leaving[entry.key] = (entry.address, time.monotonic() + SECONDS_TO_LEAVE)
         self._let_go(entry)
@@ -272,7 +222,7 @@ class UnitBoard:
         if entry is None:
             return
         if event["kind"] == "began":
-            entry.worker, entry.address = event["worker"], event["address"]
+            entry.worker, entry.address = event["name"], event["address"]
         elif event["kind"] == "progress":
             values = {name: event[name] for name in ("done", "total", "note")}
             entry.tell(Outcome(entry.identity, "progress", **values))

@@ -5,7 +5,6 @@ it; the worker then marks the task as cancelled, and the unit sees that between 
 stop a unit, and two services that want the same one do not stop it for each other.
 """
 
-import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -117,7 +116,7 @@ def run_unit(
 
     worker = get_worker()
     progress = UnitProgress(worker, key)
-    progress.tell("began", worker=str(worker.name), address=worker.address, pid=os.getpid())
+    progress.tell("began", name=str(worker.name), address=worker.address)  # Dask itself sets "worker"
     try:
         return executor(unit, spec, store_url, progress)
     except StoppedError:

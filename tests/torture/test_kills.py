@@ -1,14 +1,20 @@
 """The kill test in its short forms: with stages that answer at once, and (slow) with real ones."""
 
 import json
+import os
 import random
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
 import pytest
 
-from tests.torture.crew import VICTIMS, Crew
+from service.engine import DaskRunner
+from tests.torture.crew import ROOT, VICTIMS, Crew
+from tests.torture.tiny_job import committed, differences, tiny_spec
 from tests.torture.torture import run, torment
+from workers.thread_policy import ThreadPolicy
 
 UNITS = 1 + 1 + 1 + 6 + 20 + 1 + 4 + 1 + 1
 
@@ -36,3 +42,16 @@ def test_job_survives_the_death_of_worker_scheduler_and_service(tmp_path: Path) 
 @pytest.mark.slow
 def test_job_of_real_stages_survives_kills_with_identical_bytes(tmp_path: Path) -> None:
     assert run(tmp_path, wanted=len(VICTIMS) + 2, seed=1, num_workers=2) == 0
+
+
+@pytest.mark.slow
+def test_job_on_two_workers_makes_the_pipelines_bytes(tmp_path: Path) -> None:
+    subprocess.run(
+        [sys.executable, "-m", "tests.torture.undisturbed", str(tmp_path / "one"), "{}"],
+        cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True,
+    )  # fmt: skip
+    with DaskRunner(str(tmp_path / "two"), num_workers=2, threads=ThreadPolicy()) as runner:
+        result = runner.run("job", tiny_spec(), lambda event: None, lambda: None)
+    assert result["set_aside"] == []
+    assert result["evaluation"]["rows"][0]["non_finite"] == 0
+    assert differences(committed(tmp_path / "one"), committed(tmp_path / "two")) == []
