@@ -1,7 +1,7 @@
 """Any bits at rest: frames, caches and keys with NaN, infinity, subnormals and values beyond a half.
 
-Bounds: 32-bit layers and caches come back bit for bit; a half keeps 2^-11 of the value or 2^-25 (its last subnormal bit),
-values beyond 65504 are clamped and counted, NaN and infinity kept and counted.
+Bounds: 32-bit layers and caches come back bit for bit; a half keeps 2^-11 of the value or 2^-25 (its last subnormal
+bit), values beyond 65504 are clamped and counted, NaN and infinity kept and counted.
 """
 
 from pathlib import Path
