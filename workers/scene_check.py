@@ -61,9 +61,9 @@ def _check_mesh(mesh: Any, what: str) -> int:
 
 def _mend_normals(mesh: Any) -> list[str]:
     """Vertex normals of zero shade NaN where a triangle has three: they become the mean normal of their faces."""
-    if not mesh.has_vertex_normals():
-        return []
     parameters = mi.traverse(mesh)
+    if "vertex_normals" not in parameters:  # none, or a rectangle, which makes its own
+        return []
     normals = np.array(parameters["vertex_normals"], dtype=np.float64).reshape(-1, 3)
     missing = np.linalg.norm(normals, axis=1) <= 0
     if not missing.any():
