@@ -122,6 +122,15 @@ def measure(
     return evaluation
 
 
+def keep_ablation(store: "Store", digest: str, ablation: Record) -> bool:
+    """Puts an ablation beside the scene's record; False where the scene was not measured in this store."""
+    record = _read(store, record_file(ablation["scene"]))
+    if record is None or record["digest"] != digest:
+        return False
+    save(store, record | {"ablation": ablation})
+    return True
+
+
 def merge(previous: Record | None, record: Record) -> Record:
     """A new record with what an older one of the same scene still tells.
 

@@ -162,7 +162,7 @@ def ablate(
     with reported():
         outputs = Outputs(json=json_file)
         from service.ablations import ablation_table, measure_ablation
-        from service.benchmarks import json_bytes, shown_command, shown_path
+        from service.benchmarks import json_bytes, keep_ablation, shown_command, shown_path
         from service.options import write_file
         from service.progress import RichProgress
         from service.table import show
@@ -171,8 +171,10 @@ def ablate(
         loaded = _load(scene, resolution)
         settings = _settings(preset, loaded, assignments)
         command = shown_command(["ablate", shown_path(scene)], store, preset, resolution, assignments or [])
+        opened = Store.open(store, create=True)
         with RichProgress() as progress:
-            ablation = measure_ablation(loaded, Store.open(store, create=True), settings, progress, command)
+            ablation = measure_ablation(loaded, opened, settings, progress, command)
+        keep_ablation(opened, loaded.digest, ablation)
         show(ablation_table(ablation))
         if outputs.json is not None:
             write_file(outputs.json, json_bytes(ablation))

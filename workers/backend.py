@@ -18,6 +18,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from workers.errors import BackendError
@@ -128,7 +129,8 @@ VARIANT = _start_variant()
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
-__all__ = ["VARIANT", "dr", "find_llvm", "llvm_version", "mi", "select_llvm", "set_num_threads"]
+__all__ = ["VARIANT", "dr", "find_llvm", "llvm_version", "mi", "pool_at_rest", "select_llvm",
+           "set_num_threads"]  # fmt: skip
 
 
 def set_num_threads(num_threads: int) -> None:
@@ -142,3 +144,19 @@ def set_num_threads(num_threads: int) -> None:
     if num_threads < 1:
         raise BackendError(f"num_threads must be at least 1, got {num_threads}")
     dr.set_thread_count(num_threads)
+
+
+@contextmanager
+def pool_at_rest() -> Iterator[None]:
+    """Sends Dr.Jit's CPU threads home for the block; what Dr.Jit computes inside runs on the calling thread.
+
+    They spin for about 10 ms after each kernel. On two cores that made a network which runs right after a
+    query 1.5 times slower; ending and starting them again takes 0.1 ms.
+    """
+    num_threads = dr.thread_count()
+    dr.sync_thread()
+    dr.set_thread_count(0)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(num_threads)

@@ -2,7 +2,7 @@
 
 Path A is a closed Lissajous curve around the scene's own view (or a spline through its keyframes); path B is
 another curve in the same region that shares no pose with A. Generated curves keep looking at what the own
-view looks at, and shrink until ray casts agree that no pose is behind, inside or too close to a surface.
+view looks at; a pose that ray casts find behind, inside or too close to a surface is drawn towards the own view.
 
 The volume that caches are baked for is stated here, once: all poses within `CameraPaths.domain_radius` of a
 pose of path A (nearer where a surface is nearer) and within `CameraPaths.domain_angle_deg` of its view
@@ -27,6 +27,7 @@ TARGET_AMPLITUDE = 0.03  # how far the point looked at wanders, of the median hi
 CLEARANCE = 0.025  # closest surface, of the median hit distance
 TEST_AMPLITUDE = 0.85  # of path A's: inside the region that A spans
 KEYFRAME_TEST_AMPLITUDE = 0.04  # how far B strays from the spline of A, of the median hit distance
+MIN_ROOM = 0.05  # of an axis' amplitude, however close a surface is
 _SHRINK, _MAX_SHRINKS = 0.75, 16
 _NUM_PHASES = 24
 _MIN_DOMAIN_ANGLE_DEG = 2.0
@@ -144,38 +145,58 @@ def _interleaved(num_path: int, num_held_out: int) -> set[int]:
 
 def _generated_paths(scene: Scene, base: Camera, distance: float, num_path: int, num_test: int,
                      rng: np.random.Generator) -> tuple[list[Camera], list[Camera], list[str]]:  # fmt: skip
-    """Lissajous curves about the scene's own view, shrunk until they are clear."""
+    """Lissajous curves about the scene's own view, drawn towards it where surfaces are in the way."""
     margin = min(CLEARANCE * distance, 0.5 * float(clearance(scene, base.origin[None])[0]))
-    amplitude = np.array(AMPLITUDE) * distance * _axis_room(scene, base, distance, margin)
+    room = _axis_room(scene, base, distance, margin)
+    amplitude = np.array(AMPLITUDE) * distance
     signs, wobble = rng.choice([-1.0, 1.0], size=3), rng.uniform(0, 2 * np.pi, size=2)
     phases = rng.uniform(0, 2 * np.pi, size=(_NUM_PHASES, 3))
+    around_path = np.linspace(0, 2 * np.pi, num_path, endpoint=False)
+    curve = _fitted(_curve_a(around_path, signs), room) * amplitude
+    path = _cleared(scene, base, distance, margin, curve, _target_curve(around_path, np.zeros(2)))
+    test = _test_path(scene, base, distance, margin, amplitude, room, path, num_test, phases, wobble)
+    reach = float(np.linalg.norm(positions(path) - base.origin, axis=1).max()) / distance
     notes: list[str] = []
-    for shrinks in range(_MAX_SHRINKS + 1):
-        scale = _SHRINK**shrinks if shrinks < _MAX_SHRINKS else 0.0
-        around_path = np.linspace(0, 2 * np.pi, num_path, endpoint=False)
-        path = _aimed(base, distance, _curve_a(around_path, signs) * amplitude * scale,
-                      _target_curve(around_path, np.zeros(2)))  # fmt: skip
-        test = _test_path(base, distance, amplitude * scale, path, num_test, phases, wobble)
-        if scale == 0 or _all_clear(scene, base, path + test, margin):
-            break
-    reach = float((amplitude * scale).max()) / distance
     if reach < 0.5 * max(AMPLITUDE):
         notes.append(f"camera path shrunk to {reach:.1%} of the median distance: surfaces are close to the view")
     return path, test, notes
 
 
+def _cleared(scene: Scene, base: Camera, distance: float, margin: float, offset: Floats,
+             wander: Floats) -> list[Camera]:  # fmt: skip
+    """`_aimed`, each pose drawn towards the own view until no surface is closer than `margin` or in between."""
+    scale = np.ones((len(offset), 1))
+    for shrinks in range(_MAX_SHRINKS + 1):
+        cameras = _aimed(base, distance, offset * scale, wander)
+        origins = positions(cameras)
+        blocked = ~reachable(scene, base.origin, origins) | (clearance(scene, origins) < margin)
+        if not blocked.any():
+            break
+        scale[blocked] *= _SHRINK if shrinks < _MAX_SHRINKS - 1 else 0.0
+    return cameras
+
+
 def _axis_room(scene: Scene, base: Camera, distance: float, margin: float) -> Floats:
-    """[3] factors in [0, 1]: how much of each axis' amplitude is free on both sides of the own view."""
+    """[2, 3] factors in [0, 1]: how much of each axis' amplitude is free on its negative and positive side.
+
+    The sides are measured apart: a camera with its back to a wall still moves away from it.
+    """
     axes = base.to_world[:3, :3].T
-    wanted = np.array(AMPLITUDE) * distance
-    room = np.ones(3)
+    reach = np.array(AMPLITUDE) * distance + margin
+    signs = np.array([-1.0, 1.0])[:, None]
+    room = np.ones((2, 3))
     for factor in np.linspace(1.0, 0.0, 9):
-        ends = np.concatenate([sign * axes * (room * (wanted + margin))[:, None] for sign in (-1, 1)])
-        blocked = ~reachable(scene, base.origin, base.origin + ends).reshape(2, 3).all(axis=0)
+        ends = (signs * room * reach)[:, :, None] * axes[None]
+        blocked = ~reachable(scene, base.origin, base.origin + ends.reshape(6, 3)).reshape(2, 3)
         if not blocked.any():
             break
         room[blocked] = factor
-    return np.maximum(room, 0.05)
+    return np.maximum(room, MIN_ROOM)
+
+
+def _fitted(curve: Floats, room: Floats) -> Floats:
+    """A curve in units of the amplitude, each side of each axis scaled to its room [2, 3]; 0 stays where it is."""
+    return curve * np.where(curve < 0, room[0], room[1])
 
 
 def _curve_a(angle: Floats, signs: Floats) -> Floats:
@@ -195,17 +216,17 @@ def _target_curve(angle: Floats, phases: Floats) -> Floats:
     return np.stack([np.sin(2 * angle + phases[0]), np.sin(angle + phases[1]), 0 * angle], axis=1) - 0.5 * start
 
 
-def _test_path(base: Camera, distance: float, amplitude: Floats, path: list[Camera], num_test: int,
-               phases: Floats, wobble: Floats) -> list[Camera]:  # fmt: skip
+def _test_path(scene: Scene, base: Camera, distance: float, margin: float, amplitude: Floats, room: Floats,
+               path: list[Camera], num_test: int, phases: Floats, wobble: Floats) -> list[Camera]:  # fmt: skip
     """Of some curves, the one that stays farthest from path A."""
     if num_test == 0:
         return []
     angle = np.linspace(0, 2 * np.pi, num_test, endpoint=False)
-    curves = [_curve_b(angle, phase) * amplitude for phase in phases]
+    curves = [_fitted(_curve_b(angle, phase), room) * amplitude for phase in phases]
     known = positions(path) - base.origin
     axes = base.to_world[:3, :3]
     gaps = [np.linalg.norm((curve @ axes.T)[:, None] - known[None], axis=-1).min() for curve in curves]
-    return _aimed(base, distance, curves[int(np.argmax(gaps))], _target_curve(angle, wobble))
+    return _cleared(scene, base, distance, margin, curves[int(np.argmax(gaps))], _target_curve(angle, wobble))
 
 
 def _aimed(base: Camera, distance: float, offset: Floats, wander: Floats) -> list[Camera]:
@@ -259,11 +280,6 @@ def _strayed(scene: Scene, keyframes: list[Camera], distance: float, num_test: i
         to_world[:3, 3] += to_world[:3, :3] @ offset
         moved.append(Camera(to_world, camera.fov_deg, camera.width, camera.height))
     return moved
-
-
-def _all_clear(scene: Scene, base: Camera, cameras: list[Camera], margin: float) -> bool:
-    origins = positions(cameras)
-    return bool(reachable(scene, base.origin, origins).all()) and bool((clearance(scene, origins) >= margin).all())
 
 
 def _domain(path: list[Camera], test: list[Camera], distance: float) -> tuple[float, float]:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from storage.store import Store, UnitRef
+from workers.backend import pool_at_rest
 from workers.bake import load_caches
 from workers.camera import Camera
 from workers.element_stage import run_elements
@@ -81,7 +82,8 @@ class FrameRenderer:
         features = self.program.run(camera)
         queried = time.perf_counter()
         bad_inputs = _finite_in_place(features[..., : CHANNELS["position"][0]], 0.0)
-        radiance = self.reconstructor(features)
+        with pool_at_rest():
+            radiance = self.reconstructor(features)
         bad_outputs = _finite_in_place(radiance, features[..., slice(*CHANNELS["ir"])])
         finished = time.perf_counter()
         a, b = CHANNELS["coverage"]

@@ -1,8 +1,10 @@
 """Every number that a run can choose, with presets; checked before any work starts."""
 
 import dataclasses
+import math
 import types
 import typing
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Literal, Self
 
@@ -191,17 +193,22 @@ class Settings:
 
     @classmethod
     def from_json(cls, value: dict[str, Any]) -> "Settings":
-        """Inverse of `to_json`."""
-        parts = {f.name: f.type for f in dataclasses.fields(cls)}
-        hints = typing.get_type_hints(cls)
-        arguments = {}
-        for name in parts:
-            item = value[name]
-            if isinstance(item, dict):
-                kind = hints[name]
-                item = kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in item.items()})
-            arguments[name] = item
-        return cls(**arguments)
+        """Inverse of `to_json`; a field that is absent keeps its default.
+
+        Raises:
+            SettingsError: unknown key or a value that does not fit.
+        """
+        if not isinstance(value, dict):
+            raise SettingsError(f"settings must be a mapping, got {type(value).__name__}")
+        return cls().override(dict(_dotted(value)))
+
+
+def _dotted(value: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, item in value.items():
+        if isinstance(item, dict):
+            yield from _dotted(item, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", item
 
 
 _PRESETS: dict[str, dict[str, Any]] = {
@@ -293,8 +300,8 @@ def _check(settings: Settings) -> None:
         value: Any = settings
         for name in key.split("."):
             value = getattr(value, name)
-        if not value > 0:
-            raise SettingsError(f"setting {key!r} must be above 0, got {value}")
+        if not 0 < value < math.inf:
+            raise SettingsError(f"setting {key!r} must be above 0 and finite, got {value}")
     if settings.query.weights != "barycentric" and settings.cache.lobes != "exitant":
         raise SettingsError(
             f"setting 'query.weights' must be barycentric unless cache.lobes is exitant, got {settings.query.weights}"

@@ -16,6 +16,7 @@ from service.benchmark_page import render_page, table
 from service.benchmarks import (
     BenchmarkError,
     BenchmarkRequest,
+    keep_ablation,
     load_all,
     measure,
     merge,
@@ -270,6 +271,16 @@ def test_page_tells_that_the_machine_was_busy_and_what_is_not_known() -> None:
     page = render_page([record])
     assert "Other processes kept 1.4 of 2 CPU threads busy" in page
     assert "stages that were in the store before the first benchmark are not known" in page
+
+
+def test_keep_ablation_needs_a_record_of_the_same_scene(tmp_path: Path) -> None:
+    store = Store.open(tmp_path, create=True)
+    ablation = {"scene": "hall", "rows": [ablation_row("ours", 30.0, 32.0)]}
+    assert not keep_ablation(store, "d1", ablation)
+    save(store, make_record())
+    assert not keep_ablation(store, "another digest", ablation)
+    assert keep_ablation(store, "d1", ablation)
+    assert load_all(store)[0]["ablation"] == ablation
 
 
 def test_page_shows_the_ablation_with_its_own_command() -> None:

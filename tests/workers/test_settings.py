@@ -99,3 +99,10 @@ def test_override_as_text_equals_override_as_value(spp: int, spacing: float, fla
     }
     text = {key: str(value) for key, value in values.items()}
     assert Settings().override(values) == Settings().override(text)
+
+
+@pytest.mark.parametrize("value", [{"cahce": {"polar": 3}}, {"cache": {"polr": 3}}, {"cache": 3}, {"width": {"a": 1}},
+                                   {"train": {"learning_rate": float("inf")}}, {"width": None}, []])  # fmt: skip
+def test_from_json_refuses_what_does_not_fit(value: Any) -> None:
+    with pytest.raises(SettingsError, match="must"):
+        Settings.from_json(value)
