@@ -7,6 +7,7 @@ from workers.backend import pool_at_rest
 from workers.errors import WorkerError
 
 QUALITIES = ("fast", "balanced", "high")
+DARK_MEAN = 1e-4  # radiance; below, images are scaled before they are denoised
 
 
 def denoise(
@@ -40,17 +41,22 @@ def denoise(
     unit = _unit(radiance)
     if unit == 0.0:  # Open Image Denoise makes 3e-6 of black, which an exposure would raise to white
         return np.zeros_like(radiance, np.float32)
-    images = [None if x is None else np.ascontiguousarray(x, np.float32) for x in (radiance / unit, albedo, normal)]
+    scaled = radiance if unit == 1.0 else radiance / unit
+    images = [None if x is None else np.ascontiguousarray(x, np.float32) for x in (scaled, albedo, normal)]
     strength = getattr(mitsuba_oidn.Quality, quality.capitalize())
     with pool_at_rest():
         result = mitsuba_oidn.denoise(*images, hdr=True, clean_aux=clean_features, quality=strength)
-    return np.asarray(result) * np.float32(unit)
+    return np.asarray(result) if unit == 1.0 else np.asarray(result) * np.float32(unit)
 
 
 def _unit(radiance: np.ndarray) -> float:
-    """A power of two near the mean radiance; 0 for black.
+    """What the denoiser is to take for 1: 1 unless the image is very dark, 0 for black.
 
-    Open Image Denoise adds constants to what it takes logarithms of: radiance of 1e-8 came out 15 % wrong.
+    Open Image Denoise adds constants to what it takes logarithms of: radiance of 1e-8 came out 15 % wrong. Brighter
+    images are left as they are, so that it is timed as everybody would call it.
     """
+    mean = float(np.mean(radiance))
+    if mean >= DARK_MEAN:
+        return 1.0
     mean = float(np.mean(np.maximum(radiance, 0.0), dtype=np.float64))
     return float(2.0 ** np.round(np.log2(mean))) if mean > 0.0 else 0.0

@@ -9,7 +9,7 @@ from workers.errors import SceneError
 
 
 def check_scene(scene: Any, what: str) -> list[str]:
-    """Look at every shape and the lights; returns notes.
+    """Look at every shape and the lights, mend vertex normals without length; returns notes.
 
     Raises:
         SceneError: no shape, no light, an empty mesh, vertices, textures or other parameters that are not finite, or a
@@ -22,7 +22,7 @@ def check_scene(scene: Any, what: str) -> list[str]:
     degenerate = sum(_check_mesh(shape, what) for shape in shapes if shape.is_mesh())
     if not scene.emitters():
         raise SceneError(f"{what} must hold a light, got none; add an emitter (area, constant, envmap, point, ...)")
-    notes = []
+    notes = [note for shape in shapes if shape.is_mesh() for note in _mend_normals(shape)]
     if degenerate:
         notes.append(f"{degenerate} triangles have no area: nothing is cached on them")
     return notes
@@ -57,6 +57,29 @@ def _check_mesh(mesh: Any, what: str) -> int:
     if degenerate == len(faces):
         raise SceneError(f"{what}: mesh {name} must have area, got {degenerate} triangles without; remove it")
     return degenerate
+
+
+def _mend_normals(mesh: Any) -> list[str]:
+    """Vertex normals of zero shade NaN where a triangle has three: they become the mean normal of their faces."""
+    parameters = mi.traverse(mesh)
+    if "vertex_normals" not in parameters:  # none, or a rectangle, which makes its own
+        return []
+    normals = np.array(parameters["vertex_normals"], dtype=np.float64).reshape(-1, 3)
+    missing = np.linalg.norm(normals, axis=1) <= 0
+    if not missing.any():
+        return []
+    positions = np.array(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+    faces = np.array(parameters["faces"]).reshape(-1, 3)
+    corners = positions[faces]
+    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    mean = np.zeros_like(normals)
+    np.add.at(mean, faces.ravel(), np.repeat(face_normals, 3, axis=0))
+    length = np.linalg.norm(mean, axis=1, keepdims=True)
+    mean = np.where(length > 0, mean / np.where(length > 0, length, 1.0), [0.0, 0.0, 1.0])
+    normals[missing] = mean[missing]
+    parameters["vertex_normals"] = normals.astype(np.float32).ravel()
+    parameters.update()
+    return [f"mesh {mesh.id()}: {int(missing.sum())} vertex normals without length are taken from its faces"]
 
 
 def bounds(scene: Any) -> tuple[np.ndarray, float]:

@@ -82,7 +82,7 @@ Within = Callable[[str, float, float], None]
 
 @pytest.fixture
 def within(record_property: Callable[[str, object], None]) -> Within:
-    """Asserts that a measured value keeps its bound; `--junitxml FILE` lists both (docs/extremes.md is made of it)."""
+    """Asserts that a measured value keeps its bound; `--junitxml FILE -o junit_family=xunit1` lists both."""
 
     def check(what: str, measured: float, bound: float) -> None:
         record_property(what, f"{measured:.2g} of {bound:g}")

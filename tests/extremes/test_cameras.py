@@ -18,6 +18,7 @@ from workers.camera import Camera
 from workers.camera_path import camera_paths, domain_poses
 from workers.elements import build_elements
 from workers.errors import CameraError
+from workers.lattice import MAX_LEVEL, MAX_PATCHES, patch_counts, patch_levels
 from workers.progress import Progress
 from workers.query import CHANNELS, NUM_CHANNELS, CacheArrays, QueryProgram
 from workers.reconstruct import GBUFFER_CHANNELS, Encoding, Reconstructor
@@ -112,6 +113,13 @@ def test_8k_frame_is_its_small_frame_enlarged(prepare: Any) -> None:
 def test_cameras_beyond_single_precision_are_refused(bad: float) -> None:
     with pytest.raises(CameraError, match="must"):
         Camera.look_at([bad, 0, 0], [0, 0, 0], UP, 50, 4, 4)
+
+
+def test_surface_at_the_camera_has_the_finest_lattice_there_is() -> None:
+    """Its footprint is 0: no division warns, and counts stay within their limits; a point has the coarsest."""
+    edge, footprint = np.array([1.0, 1e6, 0.0, 1.0]), np.array([0.0, 1e-38, 0.0, np.inf])
+    assert patch_counts(edge, footprint).tolist() == [MAX_PATCHES, MAX_PATCHES, 1, 1]
+    assert patch_levels(edge, footprint, 1.5).tolist() == [MAX_LEVEL, MAX_LEVEL, 1, 0]
 
 
 @given(st.floats(-6, 6), st.tuples(*[st.floats(-1, 1)] * 3), st.tuples(*[st.floats(-1, 1)] * 3))

@@ -1,7 +1,8 @@
 """Grazing views to 89.99 degrees and roughness 1e-4 to 1.
 
-Bounds: no surface under a sky of 1 shows more than 1 (energy; 2 % for the light that the tint divides out and the noise
-of 64 paths a bin), nothing is negative beyond rounding, and a Lambertian surface looks the same at 89.99 degrees.
+Bounds: no surface under a sky of 1 shows more than 1 (energy; 2 % for the noise of 256 paths a bin), nothing is
+negative beyond rounding, and a Lambertian surface looks the same at 89.99 degrees. Dielectric principled materials may
+show 15 % more: Disney's model lays its specular lobe over an undimmed diffuse one.
 """
 
 from types import SimpleNamespace
@@ -78,9 +79,10 @@ def test_no_roughness_makes_light(patches: Patches, within: Any, name: str) -> N
     index = NAMES.index(name)
     exitant, lobe = patches.exitant[index], patches.directional[index]
     assert np.isfinite(exitant).all() and np.isfinite(lobe).all() and np.isfinite(patches.diffuse[index]).all()
-    within("exitant radiance under a sky of 1", float(exitant.max()), 1.02)
+    overlaid = name.startswith("principled") and not name.endswith(" 1")
+    within("exitant radiance under a sky of 1", float(exitant.max()), 1.15 if overlaid else 1.02)
     within("negative radiance", -float(exitant.min()), 1e-4)
-    within("irradiance", float(np.abs(patches.diffuse[index] - 1.0).max()), 0.15)
+    within("irradiance", float(np.abs(patches.diffuse[index] - 1.0).max()), 0.05)
 
 
 def test_query_factors_are_bounded_at_grazing_angles(patches: Patches, within: Any) -> None:
@@ -121,4 +123,4 @@ def test_plane_looks_the_same_at_every_angle(angle: float, within: Any) -> None:
     caches = CacheArrays(ones, np.zeros((0, 2, 2, 3), np.float32))
     features = QueryProgram(scene, table, elements, caches, QuerySettings()).run(camera)
     within("radiance", float(np.abs(features[..., :3] - COLOUR["value"]).max()), 1e-4)
-    within("missing coverage", 1.0 - float(features[..., CHANNELS["coverage"][0]].min()), 0.1)
+    within("missing coverage", 1.0 - float(features[..., CHANNELS["coverage"][0]].min()), 1e-5)

@@ -1,8 +1,8 @@
 """Training on constant, black, single-frame and tiny data, beside a firefly, and on NaN.
 
 Bound: the kept weights are never worse on the validation frame than the untrained network, which returns the caches'
-own picture; curve and weights are finite; steps whose gradient is not finite are skipped, counted, and refused
-beyond 5 %.
+own picture; curve and weights are finite; steps whose gradient is not finite are skipped, counted, and refused beyond
+5 %.
 """
 
 from types import SimpleNamespace
