@@ -58,16 +58,23 @@ class Unpacked:
     notes: list[str] = field(default_factory=list)
 
 
-class _CappedReads(io.FileIO):
-    """zipfile reads the directory of an archive in one go, as large as the archive says it is."""
+class _ArchiveFile(io.FileIO):
+    """zipfile reads the directory of an archive in one go, as large as the archive says it is, and wherever."""
 
     max_read_nbytes = 1 << 62
 
     def read(self, size: int | None = -1, /) -> bytes:
         if size is not None and size > self.max_read_nbytes:
-            raise BundleTooLargeError("bundle", f"must have a directory of at most {self.max_read_nbytes} bytes",
-                                      f"{size}; pack fewer files")  # fmt: skip
+            raise BundleTooLargeError(
+                "bundle", f"must have a directory of at most {self.max_read_nbytes} bytes", f"{size}; pack fewer files"
+            )
         return super().read(size) or b""
+
+    def seek(self, offset: int, whence: int = 0, /) -> int:
+        try:
+            return super().seek(offset, whence)
+        except OSError as error:  # no such place: the archive is damaged, not the disk
+            raise zipfile.BadZipFile(f"there is no byte {offset}") from error
 
 
 def unpack(archive: Path, folder: Path, limits: ArchiveLimits) -> Unpacked:
@@ -77,7 +84,7 @@ def unpack(archive: Path, folder: Path, limits: ArchiveLimits) -> Unpacked:
         BundleError: it is no zip, is damaged, or an entry breaks a rule; the folder may then hold some files.
         OSError: the disk does not take them.
     """
-    with _CappedReads(archive) as file:
+    with _ArchiveFile(archive) as file:
         file.max_read_nbytes = max(1 << 18, limits.max_files * _MAX_ENTRY_RECORD_NBYTES)
         try:
             opened = zipfile.ZipFile(file)
@@ -85,6 +92,7 @@ def unpack(archive: Path, folder: Path, limits: ArchiveLimits) -> Unpacked:
             raise
         except _BROKEN as error:
             raise BundleError("bundle", "must be a zip archive", f"{_told(error)}; upload a .zip") from None
+        file.max_read_nbytes = _ArchiveFile.max_read_nbytes
         with opened:
             entries = list(_checked_entries(opened.infolist(), limits))
             packed_nbytes = os.fstat(file.fileno()).st_size
