@@ -21,6 +21,7 @@ from service.errors import BundleError, BundleTooLargeError, HostileBundleError
 RATIO_FLOOR_NBYTES = 1 << 20  # so little may be compressed as well as it can be
 _CHUNK_NBYTES = 1 << 20
 _MAX_ENTRY_RECORD_NBYTES = 2048  # of the central directory, on average: name, extra fields, comment
+_LOCAL_HEADER_NBYTES = 30
 _ENCRYPTED = 0x1 | 0x40 | 0x2000
 _METHODS = {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}
 _ZIP_START = b"PK\x03\x04"
@@ -96,6 +97,7 @@ def unpack(archive: Path, folder: Path, limits: ArchiveLimits) -> Unpacked:
         with opened:
             entries = list(_checked_entries(opened.infolist(), limits))
             packed_nbytes = os.fstat(file.fileno()).st_size
+            _check_overlaps(entries, packed_nbytes)
             return _extract(opened, entries, folder, limits, packed_nbytes)
 
 
@@ -113,6 +115,16 @@ def _checked_entries(infos: list[zipfile.ZipInfo], limits: ArchiveLimits) -> Ite
         _check_kind(info, name)
         _check_collisions(name, info.is_dir(), seen)
         yield info, name
+
+
+def _check_overlaps(entries: list[tuple[zipfile.ZipInfo, str]], packed_nbytes: int) -> None:
+    """Entries that share their packed bytes unpack to more than any ratio of one entry allows (Fifield 2019)."""
+    end, later = packed_nbytes, ""
+    for info, name in sorted(entries, key=lambda entry: entry[0].header_offset, reverse=True):
+        if info.header_offset < 0 or info.header_offset + _LOCAL_HEADER_NBYTES + info.compress_size > end:
+            got = f"bytes of {later!a}" if later else "bytes that are not there"
+            raise HostileBundleError(f"entry {name!a}", "must be whole and have bytes of its own", got)
+        end, later = info.header_offset, name
 
 
 def _check_kind(info: zipfile.ZipInfo, name: str) -> None:

@@ -19,10 +19,11 @@ Entries = Mapping[str, bytes]
 
 
 def png(width: int, height: int) -> bytes:
-    """A PNG header of this size; it has no pixels."""
+    """The head of a PNG of this size; it has no pixels."""
     header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
     chunk = b"IHDR" + header
-    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    start = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    return start + struct.pack(">I", 0) + b"IDAT" + struct.pack(">I", zlib.crc32(b"IDAT"))
 
 
 def xml(body: str, version: str = "3.0.0", head: str = "") -> bytes:

@@ -80,6 +80,14 @@ def patched(field: int, form: str, value: int, local: int | None = None) -> byte
     return bytes(data)
 
 
+def overlapping() -> bytes:
+    """Two directory records of one packed entry."""
+    data = pack({"a.png": b"picture" * 9, "b.png": b"picture" * 9, "scene.xml": xml("")}).replace(b"b.png", b"a.png", 1)
+    data = bytearray(data)
+    struct.pack_into("<I", data, data.index(b"PK\x01\x02", data.index(b"PK\x01\x02") + 4) + 42, 0)
+    return bytes(data)
+
+
 def end_patched(field: int, form: str, value: int) -> bytes:
     data = bytearray(pack({"scene.xml": xml("")}))
     struct.pack_into(form, data, data.rindex(b"PK\x05\x06") + field, value)
@@ -109,7 +117,8 @@ def bad_archives() -> Iterator[Hostile]:
         ("declared-petabytes", lambda: patched(24, "<I", 0xFFFFFFF0), "unpack to at most"),
         ("compressed-beyond-end", lambda: patched(20, "<I", 1 << 20), "whole|zip archive"),
         ("directory-too-large", lambda: end_patched(12, "<I", 1 << 29), "directory|zip archive"),
-        ("directory-offset", lambda: end_patched(16, "<I", 1 << 30), "zip archive"),
+        ("directory-offset", lambda: end_patched(16, "<I", 1 << 30), "zip archive|whole"),
+        ("overlapping", overlapping, "bytes of its own"),
         ("local-name-differs", lambda: good.replace(b"a.obj", b"b.obj", 1), "whole"),
         ("garbled-directory", lambda: good.replace(b"PK\x01\x02", b"PK\x09\x09"), "zip archive"),
         ("garbled-data", lambda: good[:60] + bytes(40) + good[100:], "whole"),

@@ -31,10 +31,10 @@ def forget_secrets() -> Iterator[None]:
     redaction._secrets.clear()
 
 
-def make_client(backend: Any, tmp_path: Any, host: str = "localhost", **values: Any) -> TestClient:
+def make_client(backend: Any, tmp_path: Any, called: str = "localhost", **values: Any) -> TestClient:
     config = ServiceConfig(store_url=str(tmp_path / "store"), **values)
     app = create_app(config.store_url, make_backend=lambda: backend, config=config)
-    return TestClient(app, base_url=f"http://{host}", raise_server_exceptions=False)
+    return TestClient(app, base_url=f"http://{called}", raise_server_exceptions=False)
 
 
 @pytest.fixture

@@ -1,15 +1,15 @@
 """The list of plugins against the installed Mitsuba and the scene loader."""
 
+from importlib.util import find_spec
 from pathlib import Path
 
-import mitsuba
 import pytest
 
 from workers.errors import SceneError
 from workers.scene import load_scene
 from workers.scene_plugins import ALLOWED_PLUGINS, PLUGINS, REFUSED_PLUGINS, plugin_refusal
 
-PACKAGE = Path(mitsuba.__file__).parent
+PACKAGE = Path(str(find_spec("mitsuba").origin)).parent  # type: ignore[union-attr]
 
 
 def installed_plugins() -> set[str]:
