@@ -75,6 +75,8 @@ class _ArchiveFile(io.FileIO):
         try:
             return super().seek(offset, whence)
         except OSError as error:  # no such place: the archive is damaged, not the disk
+            if whence != os.SEEK_SET:
+                raise  # zipfile looks for an end that short files do not have
             raise zipfile.BadZipFile(f"there is no byte {offset}") from error
 
 

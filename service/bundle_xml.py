@@ -8,6 +8,7 @@ not know is refused here already.
 import posixpath
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from service.bundle_graph import check_references
@@ -69,8 +70,16 @@ def check_xml_scene(files: BundleFiles, name: str, limits: SceneLimits) -> set[s
     return document.included
 
 
-def _walk_file(document: _Document, files: BundleFiles, name: str, parent: PluginUse | None, depth: int,
-               parent_node: int = 0) -> None:  # fmt: skip
+def _walk_file(
+    document: _Document,
+    files: BundleFiles,
+    name: str,
+    parent: PluginUse | None,
+    depth: int,
+    parent_node: int = 0,
+    parent_search: Sequence[str] = (),
+) -> None:
+    """`parent_search` are the folders of the file that includes this one: it looks there after its own."""
     if depth >= MAX_INCLUDE_DEPTH:
         raise HostileBundleError(f"file {name}", f"must be included at most {MAX_INCLUDE_DEPTH} deep", "more")
     folder = posixpath.dirname(name)
@@ -80,7 +89,7 @@ def _walk_file(document: _Document, files: BundleFiles, name: str, parent: Plugi
     where = f"file {name}, <{root.tag}>"
     if not _VERSION.fullmatch(root.get("version", "")):
         raise BundleError(where, "must have a version such as 3.0.0", ascii(root.get("version", "none")[:40]))
-    walk = _Walk(document, files, name, [folder], depth)
+    walk = _Walk(document, files, name, [folder, *parent_search], depth)
     if root.tag == "scene" and parent is not None:  # its content joins that of the scene which includes it
         walk.check_attributes(root, {"version", "type", "id", "name"}, where)
         for child in root:
@@ -170,14 +179,14 @@ class _Walk:
         elif tag == "default":
             self.define(key, value, where)
         elif tag == "path":
-            path = self.files.confined(self.search[-1], value, where)
+            path = self.files.confined(posixpath.dirname(self.name), value, where)
             if not self.files.is_folder(path):
                 raise BundleError(where, "must name a folder of the bundle", ascii(value[:80]))
             self.search.insert(0, "" if path == "." else path)
         elif tag == "include":
             path = self.files.require(self.search, values.get("filename", ""), where)
             self.document.included.add(path)
-            _walk_file(self.document, self.files, path, parent, self.depth + 1, node)
+            _walk_file(self.document, self.files, path, parent, self.depth + 1, node, self.search)
 
     def add_node(self, id_: str | None, parent_node: int | None, where: str) -> int:
         document = self.document

@@ -95,6 +95,9 @@ def test_the_same_bundle_twice_is_one_and_another_name_another(client: TestClien
         {"scene.xml": xml('<include filename="parts/a.xml"/>'),
          "parts/a.xml": b'<scene version="3.0.0"><shape type="obj"><string name="filename" value="models/a.obj"/></shape></scene>',
          "models/a.obj": TRIANGLE},
+        {"scene.xml": xml('<default name="light" value="d65"/><include filename="parts/render.xml"/>'),
+         "parts/render.xml": b'<scene version="3.0.0"><include filename="lights/$light.xml"/></scene>',
+         "lights/d65.xml": b'<spectrum version="3.0.0" type="d65"/>'},
         {"scene.xml": xml('<path value="spectra"/><bsdf type="diffuse"><spectrum name="reflectance" filename="a.spd"/></bsdf>'),
          "spectra/a.spd": b"400 0.5\n700 0.5\n"},
         {"scene.xml": xml('<default name="w" value="8"/><default name="width" value="16"/><sampler type="independent">'
