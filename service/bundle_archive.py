@@ -21,6 +21,7 @@ from service.errors import BundleError, BundleTooLargeError, HostileBundleError
 RATIO_FLOOR_NBYTES = 1 << 20  # so little may be compressed as well as it can be
 _CHUNK_NBYTES = 1 << 20
 _MAX_ENTRY_RECORD_NBYTES = 2048  # of the central directory, on average: name, extra fields, comment
+_LOCAL_HEADER_NBYTES = 30
 _ENCRYPTED = 0x1 | 0x40 | 0x2000
 _METHODS = {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}
 _ZIP_START = b"PK\x03\x04"
@@ -58,16 +59,25 @@ class Unpacked:
     notes: list[str] = field(default_factory=list)
 
 
-class _CappedReads(io.FileIO):
-    """zipfile reads the directory of an archive in one go, as large as the archive says it is."""
+class _ArchiveFile(io.FileIO):
+    """zipfile reads the directory of an archive in one go, as large as the archive says it is, and wherever."""
 
     max_read_nbytes = 1 << 62
 
     def read(self, size: int | None = -1, /) -> bytes:
         if size is not None and size > self.max_read_nbytes:
-            raise BundleTooLargeError("bundle", f"must have a directory of at most {self.max_read_nbytes} bytes",
-                                      f"{size}; pack fewer files")  # fmt: skip
+            raise BundleTooLargeError(
+                "bundle", f"must have a directory of at most {self.max_read_nbytes} bytes", f"{size}; pack fewer files"
+            )
         return super().read(size) or b""
+
+    def seek(self, offset: int, whence: int = 0, /) -> int:
+        try:
+            return super().seek(offset, whence)
+        except OSError as error:  # no such place: the archive is damaged, not the disk
+            if whence != os.SEEK_SET:
+                raise  # zipfile looks for an end that short files do not have
+            raise zipfile.BadZipFile(f"there is no byte {offset}") from error
 
 
 def unpack(archive: Path, folder: Path, limits: ArchiveLimits) -> Unpacked:
@@ -77,7 +87,7 @@ def unpack(archive: Path, folder: Path, limits: ArchiveLimits) -> Unpacked:
         BundleError: it is no zip, is damaged, or an entry breaks a rule; the folder may then hold some files.
         OSError: the disk does not take them.
     """
-    with _CappedReads(archive) as file:
+    with _ArchiveFile(archive) as file:
         file.max_read_nbytes = max(1 << 18, limits.max_files * _MAX_ENTRY_RECORD_NBYTES)
         try:
             opened = zipfile.ZipFile(file)
@@ -85,9 +95,11 @@ def unpack(archive: Path, folder: Path, limits: ArchiveLimits) -> Unpacked:
             raise
         except _BROKEN as error:
             raise BundleError("bundle", "must be a zip archive", f"{_told(error)}; upload a .zip") from None
+        file.max_read_nbytes = _ArchiveFile.max_read_nbytes
         with opened:
             entries = list(_checked_entries(opened.infolist(), limits))
             packed_nbytes = os.fstat(file.fileno()).st_size
+            _check_overlaps(entries, packed_nbytes)
             return _extract(opened, entries, folder, limits, packed_nbytes)
 
 
@@ -105,6 +117,16 @@ def _checked_entries(infos: list[zipfile.ZipInfo], limits: ArchiveLimits) -> Ite
         _check_kind(info, name)
         _check_collisions(name, info.is_dir(), seen)
         yield info, name
+
+
+def _check_overlaps(entries: list[tuple[zipfile.ZipInfo, str]], packed_nbytes: int) -> None:
+    """Entries that share their packed bytes unpack to more than any ratio of one entry allows (Fifield 2019)."""
+    end, later = packed_nbytes, ""
+    for info, name in sorted(entries, key=lambda entry: entry[0].header_offset, reverse=True):
+        if info.header_offset < 0 or info.header_offset + _LOCAL_HEADER_NBYTES + info.compress_size > end:
+            got = f"bytes of {later!a}" if later else "bytes that are not there"
+            raise HostileBundleError(f"entry {name!a}", "must be whole and have bytes of its own", got)
+        end, later = info.header_offset, name
 
 
 def _check_kind(info: zipfile.ZipInfo, name: str) -> None:

@@ -7,7 +7,8 @@ from pathlib import PurePosixPath
 
 from service.bundle_mesh import check_mesh_scene, check_obj
 from service.bundle_rules import BundleFiles, SceneLimits
-from service.bundle_xml import check_xml_scene, parse_xml
+from service.bundle_xml import check_xml_scene
+from service.bundle_xml_text import parse_xml
 from service.bundle_yaml import check_yaml_scene, parse_yaml
 from service.errors import BundleError, HostileBundleError
 

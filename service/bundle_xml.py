@@ -2,23 +2,21 @@
 
 The file is read as Mitsuba's own parser reads it (its tags, their attributes, <default> substitution in document
 order, <include> with the same parameters), so that what is judged is what will be built. What that parser does
-not know is refused here already, and so is every XML feature that scenes do not need: document types, entities,
-other encodings than UTF-8.
+not know is refused here already.
 """
 
 import posixpath
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from service.bundle_graph import check_references
 from service.bundle_rules import BundleFiles, PluginUse, SceneLimits, check_plugin, parse_number, snake_case
+from service.bundle_xml_text import MAX_ELEMENTS, parse_xml
 from service.errors import BundleError, HostileBundleError
 from workers.scene_plugins import PLUGINS
 
-MAX_XML_NBYTES = 32 << 20
-MAX_ELEMENTS = 500_000
-MAX_NESTING = 64
 MAX_INCLUDE_DEPTH = 15  # Mitsuba's own
 MAX_EXPANDED = 4 << 20  # characters that parameters may add, all together
 OBJECT_TAGS = frozenset({*PLUGINS, "scene", "spectrum"})
@@ -33,7 +31,6 @@ _ATTRIBUTES = {
     "include": {"filename", "name"}, "alias": {"id", "as"}, "path": {"value"},
 }  # fmt: skip
 _PARAMETER = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
-_DECLARATION = re.compile(rb"\s*<\?xml[^>]*?encoding\s*=\s*[\"']([^\"']*)[\"']")
 _VERSION = re.compile(r"\d{1,4}(\.\d{1,6}){2}")
 _INTEGER = re.compile(r"\s*-?\d{1,18}\s*")
 
@@ -52,56 +49,6 @@ class _Document:
     uses: list[tuple[str, PluginUse]] = field(default_factory=list)  # (tag, plugin)
     num_elements: int = 0
     expanded: int = 0
-
-
-def parse_xml(files: BundleFiles, name: str) -> ET.Element:
-    """The root of an XML file of the bundle.
-
-    Raises:
-        HostileBundleError: a document type or entity, or more elements than any scene needs.
-        BundleError: it is too large, no UTF-8 or not well-formed.
-    """
-    from defusedxml import ElementTree
-    from defusedxml.common import DefusedXmlException
-
-    path = files.root / name
-    where, nbytes = f"file {name}", path.stat().st_size
-    if nbytes > MAX_XML_NBYTES:
-        raise BundleError(where, f"must have at most {MAX_XML_NBYTES} bytes", f"{nbytes}")
-    content = path.read_bytes()
-    _check_encoding(content, where)
-    depth = count = 0
-    root: ET.Element | None = None
-    try:
-        with path.open("rb") as file:
-            for event, element in ElementTree.iterparse(file, events=("start", "end"), forbid_dtd=True):
-                root = element if root is None else root
-                depth += 1 if event == "start" else -1
-                count += event == "start"
-                if depth > MAX_NESTING or count > MAX_ELEMENTS:
-                    raise HostileBundleError(
-                        where, f"must nest at most {MAX_NESTING} and hold {MAX_ELEMENTS} elements", "more"
-                    )
-    except DefusedXmlException:
-        raise HostileBundleError(where, "must be XML without document type and entities", "one") from None
-    except (ET.ParseError, ValueError, LookupError) as error:
-        if isinstance(error, BundleError):
-            raise
-        raise BundleError(where, "must be well-formed XML", " ".join(str(error).split())) from None
-    assert root is not None  # otherwise it is not well-formed
-    return root
-
-
-def _check_encoding(content: bytes, where: str) -> None:
-    """Two parsers read the file; only in UTF-8 do they surely read the same."""
-    declared = _DECLARATION.match(content.removeprefix(b"\xef\xbb\xbf"))
-    encoding = declared[1].decode("ascii", "replace").lower() if declared else "utf-8"
-    try:
-        content.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise BundleError(where, "must be UTF-8 text", f"{error.reason} at byte {error.start}") from None
-    if encoding not in ("utf-8", "utf8", "us-ascii", "ascii") or b"\x00" in content:
-        raise BundleError(where, "must be UTF-8 text", f"{encoding!a} or zero bytes; save it as UTF-8")
 
 
 def check_xml_scene(files: BundleFiles, name: str, limits: SceneLimits) -> set[str]:
@@ -123,8 +70,16 @@ def check_xml_scene(files: BundleFiles, name: str, limits: SceneLimits) -> set[s
     return document.included
 
 
-def _walk_file(document: _Document, files: BundleFiles, name: str, parent: PluginUse | None, depth: int,
-               parent_node: int = 0) -> None:  # fmt: skip
+def _walk_file(
+    document: _Document,
+    files: BundleFiles,
+    name: str,
+    parent: PluginUse | None,
+    depth: int,
+    parent_node: int = 0,
+    parent_search: Sequence[str] = (),
+) -> None:
+    """`parent_search` are the folders of the file that includes this one: it looks there after its own."""
     if depth >= MAX_INCLUDE_DEPTH:
         raise HostileBundleError(f"file {name}", f"must be included at most {MAX_INCLUDE_DEPTH} deep", "more")
     folder = posixpath.dirname(name)
@@ -134,7 +89,7 @@ def _walk_file(document: _Document, files: BundleFiles, name: str, parent: Plugi
     where = f"file {name}, <{root.tag}>"
     if not _VERSION.fullmatch(root.get("version", "")):
         raise BundleError(where, "must have a version such as 3.0.0", ascii(root.get("version", "none")[:40]))
-    walk = _Walk(document, files, name, [folder], depth)
+    walk = _Walk(document, files, name, [folder, *parent_search], depth)
     if root.tag == "scene" and parent is not None:  # its content joins that of the scene which includes it
         walk.check_attributes(root, {"version", "type", "id", "name"}, where)
         for child in root:
@@ -224,14 +179,14 @@ class _Walk:
         elif tag == "default":
             self.define(key, value, where)
         elif tag == "path":
-            path = self.files.confined(self.search[-1], value, where)
+            path = self.files.confined(posixpath.dirname(self.name), value, where)
             if not self.files.is_folder(path):
                 raise BundleError(where, "must name a folder of the bundle", ascii(value[:80]))
             self.search.insert(0, "" if path == "." else path)
         elif tag == "include":
             path = self.files.require(self.search, values.get("filename", ""), where)
             self.document.included.add(path)
-            _walk_file(self.document, self.files, path, parent, self.depth + 1, node)
+            _walk_file(self.document, self.files, path, parent, self.depth + 1, node, self.search)
 
     def add_node(self, id_: str | None, parent_node: int | None, where: str) -> int:
         document = self.document

@@ -2,23 +2,28 @@
 
 import time
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from storage.store import Store, UnitRef
-from workers.backend import pool_at_rest
 from workers.bake import load_caches
 from workers.camera import Camera
+from workers.code_versions import ENTRY, check_versions, code_versions
 from workers.element_stage import run_elements
 from workers.errors import WorkerError
+from workers.footprint import scene_nbytes
 from workers.progress import Progress
+from workers.published import renderable_scenes
 from workers.query import CHANNELS, QueryProgram
 from workers.reconstruct import Reconstructor
 from workers.run_state import RunState
 from workers.scene import load_scene
 from workers.settings import Settings
 from workers.train import load_network
+
+__all__ = ["Frame", "FrameRenderer", "open_run", "publish", "renderable_scenes"]
 
 
 @dataclass(frozen=True)
@@ -76,14 +81,18 @@ class FrameRenderer:
             renderer.render(run.scene.camera.resized(run.settings.width, run.settings.height))
         return renderer
 
+    @cached_property
+    def nbytes(self) -> int:
+        """Memory that the open scene holds, bytes (`workers/footprint.py`)."""
+        return scene_nbytes(self.program, self.reconstructor)
+
     def render(self, camera: Camera) -> Frame:
         """Reconstructs the frame of a camera; any pose is answered."""
         start = time.perf_counter()
         features = self.program.run(camera)
         queried = time.perf_counter()
         bad_inputs = _finite_in_place(features[..., : CHANNELS["position"][0]], 0.0)
-        with pool_at_rest():
-            radiance = self.reconstructor(features)
+        radiance = self.reconstructor(features)
         bad_outputs = _finite_in_place(radiance, features[..., slice(*CHANNELS["ir"])])
         finished = time.perf_counter()
         a, b = CHANNELS["coverage"]
@@ -116,7 +125,7 @@ def publish(run: RunState, network_ref: UnitRef, psnr: float | None) -> None:
         {
             "name": run.scene.name, "source": str(run.scene.source), "settings": run.settings.to_json(),
             "network": network_ref.key, "width": run.settings.width, "height": run.settings.height,
-            "preset": run.settings.preset, "psnr": psnr,
+            "preset": run.settings.preset, "psnr": psnr, ENTRY: code_versions(),
         },
     )  # fmt: skip
 
@@ -125,13 +134,14 @@ def open_run(store: Store, entry: dict[str, Any], progress: Progress) -> tuple[R
     """The run that a scene is served from and its network.
 
     Raises:
-        WorkerError: the scene was never run to its end, or its files have changed since.
+        WorkerError: the scene was never run to its end, its files have changed since, or another version ran it.
     """
     if "network" not in entry:
         raise WorkerError(
             f"scene {entry['name']!r} must have a trained network in {store.url}, got none; "
             f"run: lightwell run {entry.get('source', 'SCENE')} --store {store.url}"
         )
+    check_versions(entry, store.url)
     settings = Settings.from_json(entry["settings"])
     scene = load_scene(entry["source"], width=settings.width, height=settings.height)
     if scene.digest != entry["digest"]:
@@ -140,9 +150,3 @@ def open_run(store: Store, entry: dict[str, Any], progress: Progress) -> tuple[R
             f"run: lightwell run {entry['source']} --store {store.url}"
         )
     return RunState(scene, store, settings, progress), UnitRef(scene.digest, "train", entry["network"])
-
-
-def renderable_scenes(store: Store) -> list[dict[str, Any]]:
-    """Scenes of a store that can be served."""
-    names = ("name", "digest", "width", "height", "preset", "psnr")
-    return [{name: entry.get(name) for name in names} for entry in store.scenes() if "network" in entry]

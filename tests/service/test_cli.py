@@ -279,3 +279,11 @@ def test_serve_refuses_a_port_in_use(store: str) -> None:
     with bind("127.0.0.1", 0) as taken:
         port = taken.getsockname()[1]
         assert_mistake(invoke("serve", "--store", store, "--port", str(port)), "choose another --host or --port")
+
+
+def test_serve_beyond_this_machine_wants_a_token(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    Store.open(store, create=True)
+    monkeypatch.delenv("LIGHTWELL_TOKEN", raising=False)
+    assert_mistake(invoke("serve", "--store", store, "--host", "0.0.0.0", "--port", "0"), "set LIGHTWELL_TOKEN")
+    monkeypatch.setenv("LIGHTWELL_TOKEN", "two words")
+    assert_mistake(invoke("serve", "--store", store), "token must be printable ASCII")
