@@ -14,6 +14,7 @@ from workers.bake import _bake_units, _Lobe
 from workers.camera import Camera
 from workers.errors import QuarantinedError
 from workers.pathtrace import trace
+from workers.progress import Progress
 from workers.render import run_render
 from workers.run_state import RunState
 from workers.scene import load_scene
@@ -33,7 +34,7 @@ def test_bake_unit_over_its_limit_is_set_aside_and_the_others_are_kept(store: St
     caches = CacheSet.create_or_open(
         store, ref, [ArraySpec("mean", (PER_UNIT * NUM_UNITS, 3), "float32", PER_UNIT)], {}
     )
-    run: Any = types.SimpleNamespace(settings=Settings.preset_named("tiny"), store=store)
+    run: Any = types.SimpleNamespace(settings=Settings.preset_named("tiny"), store=store, progress=Progress())
     values = np.ones((PER_UNIT * NUM_UNITS, 3), np.float32)
     values[PER_UNIT] = np.nan  # in unit 1
     lobe = _Lobe("diffuse", {}, {"mean": (3,)}, np.arange(len(values)), 1, lambda batch, index: {"mean": values})
