@@ -126,6 +126,9 @@ async def _warm_up(rendering: RenderThread, readiness: Readiness) -> None:
     except known_errors() as error:
         log.error("warm-up: %s", one_line(error))
         readiness.failed(f"the warm-up failed: {one_line(error)}")
+    except Exception:  # a fault of ours: said as well, for a service that stays "starting" tells nobody why
+        log.exception("warm-up")
+        readiness.failed("the warm-up failed, see the service's log")
     else:
         readiness.ready()
 

@@ -104,7 +104,6 @@ def test_a_terminated_service_releases_its_job_and_the_next_one_ends_it(
     assert len(units) == len(set(units)) == NUM_UNITS
 
 
-@pytest.mark.slow  # a time that only a quiet machine shows
 def test_a_service_with_ten_thousand_finished_jobs_starts_in_three_seconds(
     start: Callable[[], Any], tmp_path: Path, wait_until: Callable[..., None]
 ) -> None:
