@@ -2,6 +2,8 @@
 about it.
 
 load_scene("scene.xml") | load_scene("scene.yaml") | load_scene("chair.glb") | load_scene("tabletop")
+
+A source may end in a variation, "tabletop#seed=3,materials=0.5" (`workers/variation.py`).
 """
 
 import hashlib
@@ -32,8 +34,10 @@ from workers.scene_nodes import (
     sensor_pose,
     set_film_size,
 )
+from workers.scene_variation import content_of, vary_scene
 from workers.scene_xml import read_xml
 from workers.scene_yaml import YAML_SUFFIXES, read_yaml
+from workers.variation import Variation, split_source
 
 DIGEST_VERSION = 1
 
@@ -56,6 +60,7 @@ class Scene:
         notes: what was added, changed or ignored, one line each.
         settings: overrides of the run's settings that the scene file asks for.
         source: what `load_scene` was given.
+        variation: parameters and changes of a varied scene; empty otherwise.
     """
 
     name: str
@@ -70,6 +75,7 @@ class Scene:
     notes: tuple[str, ...] = ()
     settings: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     source: str
+    variation: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
 
     @property
     def bounds_centre(self) -> np.ndarray:
@@ -114,7 +120,7 @@ def load_scene(source: str | Path, *, width: int | None = None, height: int | No
 
     Args:
         source: path of a Mitsuba XML, a YAML or a mesh file, or the name of a built-in scene
-            ("tabletop", "tiny", also "builtin:tabletop").
+            ("tabletop", "tiny", also "builtin:tabletop"); with a variation after a "#".
         width: image width in pixels; default: the scene's film, or from `height` and the film's aspect.
         height: image height in pixels, likewise.
         max_depth: replaces the longest path of the file's integrator, in edges; -1 is unlimited.
@@ -122,8 +128,10 @@ def load_scene(source: str | Path, *, width: int | None = None, height: int | No
     Raises:
         SceneError: the scene is missing, broken, or asks for what caches cannot represent.
         CameraError: the image size is not usable.
+        VariationError: what follows a "#" is no variation.
     """
-    name, draft = _read(source)
+    base, variation = split_source(source)
+    name, draft = _read(base)
     draft.notes += audit_nodes(draft.state, draft.what)
     name_shapes(draft.state)
     sensor, sensor_notes = first_sensor(draft.state, draft.what)
@@ -144,6 +152,7 @@ def load_scene(source: str | Path, *, width: int | None = None, height: int | No
     else:
         clips = [None, None]
     mi_scene = instantiate(draft.state, draft.what)
+    varied = _vary(mi_scene, draft, variation)
     draft.notes += check_scene(mi_scene, draft.what)
     if pose is not None:
         camera = Camera(pose, horizontal_fov_deg(sensor, *pixels, draft.what), *pixels)
@@ -151,8 +160,8 @@ def load_scene(source: str | Path, *, width: int | None = None, height: int | No
         assert draft.make_camera is not None
         camera = draft.make_camera(*pixels)
     near, far = _clip_distances(mi_scene, camera, clips[0], clips[1])
-    return Scene(
-        name=name,
+    scene = Scene(
+        name=f"{name}-v{variation.tag}" if variation and variation.changes_something else name,
         digest=_digest(draft, depth if depth != file_depth else None),
         mi_scene=mi_scene,
         camera=camera,
@@ -164,7 +173,24 @@ def load_scene(source: str | Path, *, width: int | None = None, height: int | No
         notes=tuple(draft.notes),
         settings=MappingProxyType(draft.settings),
         source=str(source),
+        variation=MappingProxyType(varied),
     )
+    return _with_varied_views(scene, variation) if variation else scene
+
+
+def _vary(mi_scene: Any, draft: SceneDraft, variation: Variation | None) -> dict[str, Any]:
+    """Applies a variation to the built scene and to what its digest is made from."""
+    if variation is None:
+        return {}
+    changes = vary_scene(mi_scene, variation)
+    draft.content += content_of(changes, variation)
+    return {**variation.to_json(), "changes": changes}
+
+
+def _with_varied_views(scene: Scene, variation: Variation) -> Scene:
+    from workers.camera_variation import vary_cameras  # it casts rays into a Scene: this module comes first
+
+    return vary_cameras(scene, variation)
 
 
 def _read(source: str | Path) -> tuple[str, SceneDraft]:
