@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from service.batch_cli import batch_app, dataset
+from service.export_cli import export
 from service.failures import reported
 from service.options import check_writable, parse_look_at, parse_overrides, parse_size
 from service.outcome import Outputs, finish, frame_request_lines
@@ -21,6 +23,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.add_typer(batch_app)
 
 SceneArgument = Annotated[
     str,
@@ -260,6 +263,10 @@ def serve(
         from service.serving import serve_store
 
         serve_store(store, host, port)
+
+
+app.command()(dataset)
+app.command()(export)
 
 
 def main() -> None:

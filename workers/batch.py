@@ -55,17 +55,30 @@ def open_items(items: list[BatchItem], store: Store, progress: Progress) -> Iter
     Raises:
         WorkerError: a scene or its settings are not valid.
     """
-    loaded: tuple[Any, Scene] | None = None
+    loader = _Loader()
     for item in items:
-        asked = (item.scene, item.resolution)
-        if loaded is None or loaded[0] != asked:
-            loaded = (asked, _load(item))
-        yield item, open_item(item, store, progress, loaded[1])
+        yield item, _open_item(item, store, progress, loader)
 
 
-def open_item(item: BatchItem, store: Store, progress: Progress, scene: Scene | None = None) -> RunState:
+class _Loader:
+    """Keeps the scene that was loaded last: presets of one variant follow each other."""
+
+    def __init__(self) -> None:
+        self._asked: tuple[str, tuple[int, int] | None] | None = None
+        self._scene: Scene | None = None
+
+    def load(self, item: BatchItem) -> Scene:
+        if self._scene is None or self._asked != (item.scene, item.resolution):
+            self._asked = self._scene = None  # frees the one before, also where the next cannot be loaded
+            width, height = item.resolution or (None, None)
+            self._scene = load_scene(item.scene, width=width, height=height)
+            self._asked = (item.scene, item.resolution)
+        return self._scene
+
+
+def _open_item(item: BatchItem, store: Store, progress: Progress, loader: _Loader) -> RunState:
     """The run of one combination: preset, then what the scene's file asks for, then the batch's settings."""
-    scene = scene or _load(item)
+    scene = loader.load(item)
     if item.settings is not None:
         return RunState(scene, store, item.settings, progress)
     size = {"width": scene.camera.width, "height": scene.camera.height}
@@ -91,10 +104,10 @@ def plan_batch(items: list[BatchItem], store: Store, progress: Progress) -> list
 
 def run_batch(items: list[BatchItem], store: Store, progress: Progress) -> list[ItemResult]:
     """Runs every combination; what is committed already is not computed again."""
-    results = []
+    results, loader = [], _Loader()
     with progress.track("batch", len(items)) as advance:
         for item in items:
-            result = _run_or_tell(item, store, progress)
+            result = _run_or_tell(item, store, progress, loader)
             if result.error is not None:
                 progress.message(f"{result.label} failed: {result.error}")
             results.append(result)
@@ -102,14 +115,14 @@ def run_batch(items: list[BatchItem], store: Store, progress: Progress) -> list[
     return results
 
 
-def _run_or_tell(item: BatchItem, store: Store, progress: Progress) -> ItemResult:
+def _run_or_tell(item: BatchItem, store: Store, progress: Progress, loader: _Loader) -> ItemResult:
     start = time.perf_counter()
     name = digest = ""
     units: list[FrameUnit] = []
     missing: set[Any] = set()
     error = None
     try:
-        run = open_item(item, store, progress)
+        run = _open_item(item, store, progress, loader)
         name, digest = run.scene.name, run.scene.digest
         units = frame_units(run, item.input_spp)
         missing = {unit.ref for unit in units if store.committed(unit.ref) is None}
@@ -133,8 +146,3 @@ def run_item(item: BatchItem, run: RunState, units: list[FrameUnit]) -> None:
         run_scene(scene, run.store, run.settings, run.progress)
     elif "bake" in item.stages:
         run_bake(run, run_elements(run))
-
-
-def _load(item: BatchItem) -> Scene:
-    width, height = item.resolution or (None, None)
-    return load_scene(item.scene, width=width, height=height)

@@ -1,4 +1,4 @@
-"""The frames of one combination: a reference for each pose of both camera paths, noisy ones of the same pose beside it."""
+"""The frames of one combination: for each pose of both camera paths a reference, and noisy frames beside it."""
 
 from dataclasses import dataclass
 
@@ -42,15 +42,22 @@ def frame_units(run: RunState, input_spp: tuple[int, ...]) -> list[FrameUnit]:
     units = []
     for part in PARTS:
         reference_spp = run.settings.frames.test_spp if part == "test" else run.settings.frames.train_spp
-        if input_spp and max(input_spp) >= reference_spp:
+        rendered = [rendered_spp(run, spp) for spp in (*input_spp, reference_spp)]
+        if rendered != sorted(set(rendered)):
             raise BatchError(
-                f"input_spp must be below the samples of the references ({reference_spp} of part {part}), "
-                f"got {max(input_spp)}; leave it out or raise frames.train_spp and frames.test_spp"
+                f"input_spp must rise, and stay below the references' {rendered[-1]} of part {part}, got "
+                f"{rendered[:-1]} (each is rounded up to a multiple of frames.passes); leave some out"
             )
         for index, camera in enumerate(getattr(run.paths, part)):
             for spp, role in [*((spp, "input") for spp in input_spp), (reference_spp, "reference")]:
                 units.append(FrameUnit(part, index, role, camera, spp, render_ref(run, camera, spp)))
     return units
+
+
+def rendered_spp(run: RunState, spp: int) -> int:
+    """Samples that the render stage takes where `spp` are asked for: equal passes, rounded up."""
+    passes = min(run.settings.frames.passes, spp)
+    return -(-spp // passes) * passes
 
 
 def render_frames(run: RunState, units: list[FrameUnit]) -> None:

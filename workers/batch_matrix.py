@@ -1,15 +1,15 @@
 """A batch as it is written: scenes x presets x variations in one YAML file.
 
-    scenes: [tabletop, rooms/hall.xml]        # files relative to this one, or names of built-in scenes
-    presets: [draft, {name: draft, label: wide, settings: {width: 384}}]
-    variations:
-      - name: original                        # changes nothing
-      - {name: colours, count: 3, materials: 0.7, light: [0.5, 2.0], light_colour: 0.3, camera: 0.1}
-    stages: [render]                          # bake, render, train: a later one includes those before
-    input_spp: [1, 4]                         # noisy frames beside each reference
-    settings: {frames.num_train: 8}           # for all
-    resolution: [256, 256]
-    seed: 0                                   # every variation's seed derives from it
+scenes: [tabletop, rooms/hall.xml]        # files relative to this one, or names of built-in scenes
+presets: [draft, {name: draft, label: wide, settings: {width: 384}}]
+variations:
+  - name: original                        # changes nothing
+  - {name: colours, count: 3, materials: 0.7, light: [0.5, 2.0], light_colour: 0.3, camera: 0.1}
+stages: [render]                          # bake, render, train: a later one includes those before
+input_spp: [1, 4]                         # noisy frames beside each reference
+settings: {frames.num_train: 8}           # for all
+resolution: [256, 256]
+seed: 0                                   # every variation's seed derives from it
 """
 
 from collections.abc import Iterator
@@ -66,7 +66,7 @@ class Matrix(_Row):
 
     scenes: list[str] = Field(min_length=1)
     presets: list[str | PresetRow] = Field(default=["draft"], min_length=1)
-    variations: list[VariationRow] = Field(default=[VariationRow(name="original")], min_length=1)
+    variations: list[VariationRow] = Field(default=[VariationRow(name="original", count=1)], min_length=1)
     stages: list[Stage] = Field(default=["render"], min_length=1)
     input_spp: list[Annotated[int, Field(ge=1, le=1_000_000)]] = [1]
     settings: dict[str, Any] = {}

@@ -56,7 +56,7 @@ def content_of(changes: list[dict[str, Any]], variation: Variation) -> list[tupl
     return [("variation", text_hash(canonical_json(content).decode("ascii")))]
 
 
-# ------------------------------------------------------ materials ------------------------------------------------------
+# ---------------------------------------------------- materials -----------------------------------------------------
 
 
 def _materials(mi_scene: Any) -> Iterator[tuple[str, Any, bool]]:
@@ -98,7 +98,7 @@ def _texel_gain(share: float, rng: np.random.Generator) -> Floats:
     return _rounded(1 - share * (1 - rng.uniform(0.25, 1.0, 3)))
 
 
-# -------------------------------------------------------- lights -------------------------------------------------------
+# ------------------------------------------------------ lights ------------------------------------------------------
 
 
 def _lights(mi_scene: Any) -> Iterator[tuple[str, Any]]:
@@ -152,7 +152,7 @@ def _is_emission(key: str, value: Any) -> bool:
     return leaf == "data"  # the texels of an environment map, or of a textured area light
 
 
-# ------------------------------------------------------ parameters -----------------------------------------------------
+# ---------------------------------------------------- parameters ----------------------------------------------------
 
 
 def _is_colour(value: Any) -> bool:
