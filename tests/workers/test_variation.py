@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from tests.workers.test_scene_xml import FLOOR, sensor, write
+from workers import camera_variation
 from workers.backend import mi
+from workers.camera_clearance import clearance
 from workers.scene import Scene, load_scene
 from workers.scene_variation import LUMINANCE
 from workers.variation import Variation, VariationError, join_source, split_source
@@ -161,8 +163,17 @@ def test_camera_variation_moves_all_views_and_leaves_the_light_alone() -> None:
     np.testing.assert_array_equal(image(moved, "a:albedo").shape, image(plain, "a:albedo").shape)
 
 
-def test_views_that_cannot_move_stay_and_are_told(tmp_path: Path) -> None:
-    tight = '<shape type="sphere"><float name="radius" value="{0}"/><point name="center" x="0" y="1" z="5"/></shape>'
-    path = write(tmp_path, sensor(), tight.format(1e-7), '<emitter type="constant"/>')
-    moved = load_scene(f"{path}#camera=0.5")
-    assert moved.camera == load_scene(path).camera or not moved.notes
+def test_views_that_cannot_move_stay_and_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(camera_variation, "_clear", lambda *arguments: False)
+    moved = load_scene("tiny#camera=0.5")
+    assert moved.camera == load_scene("tiny").camera
+    assert any("could not be moved" in note for note in moved.notes)
+
+
+def test_moved_views_keep_clear_of_surfaces() -> None:
+    plain = load_scene("tiny")
+    for seed in range(6):
+        moved = load_scene(f"tiny#seed={seed},camera=0.5")
+        views = [moved.camera, *moved.keyframes, *moved.test_keyframes]
+        assert not moved.notes
+        assert clearance(plain, np.array([view.origin for view in views])).min() > 0.02
