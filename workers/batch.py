@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from storage.errors import StorageError
+from storage.layout import scene_file
 from storage.store import Store
 from workers.bake import run_bake
 from workers.batch_frames import FrameUnit, frame_units, render_frames
@@ -137,10 +138,10 @@ def _run_or_tell(item: BatchItem, store: Store, progress: Progress, loader: _Loa
 def run_item(item: BatchItem, run: RunState, units: list[FrameUnit]) -> None:
     """Runs one combination's stages; its frames always, for a dataset is made of them."""
     scene = run.scene
-    known = {entry["digest"]: entry for entry in run.store.scenes()}.get(scene.digest, {})
-    run.store.register_scene(
-        scene.digest, {**known, "name": scene.name, "source": scene.source, "variation": dict(scene.variation)}
-    )
+    # Not by listing what the store knows: a batch has as many scenes as combinations.
+    if not run.store.files.exists(scene_file(scene.digest)):
+        facts = {"name": scene.name, "source": scene.source, "variation": dict(scene.variation)}
+        run.store.register_scene(scene.digest, facts)
     render_frames(run, units)
     if "train" in item.stages:  # the pipeline trains and measures in one go; the frames are there by now
         run_scene(scene, run.store, run.settings, run.progress)
