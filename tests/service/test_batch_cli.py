@@ -17,9 +17,9 @@ scenes: [tiny{more}]
 presets: [tiny]
 variations: [{{name: bright, light: [2, 4]}}]
 resolution: [16, 16]
-settings: {{frames.num_train: 1, frames.num_validation: 0, frames.num_test: 1, frames.train_spp: 4, frames.test_spp: 4}}
+settings: {{frames.num_train: 1, frames.num_test: 1, frames.train_spp: 4, frames.test_spp: 4}}
 """
-SMALL = ["--set", "frames.num_train=1", "--set", "frames.num_validation=0", "--set", "frames.num_test=1",
+SMALL = ["--set", "frames.num_train=1", "--set", "frames.num_test=1",
          "--set", "frames.train_spp=4", "--set", "frames.test_spp=4", "--resolution", "16x16"]  # fmt: skip
 
 
@@ -37,14 +37,14 @@ def test_plan_run_and_dataset_follow_each_other(tmp_path: Path) -> None:
     batch, store = batch_file(tmp_path), tmp_path / "store"
     planned = invoke("batch", "plan", batch, "--store", store)
     assert planned.exit_code == 0, planned.output
-    assert "4 of 4 frames to render" in planned.output and "1 combinations" in planned.output
+    assert "6 of 6 frames to render" in planned.output and "1 combinations" in planned.output
     ran = invoke("batch", "run", batch, "--store", store, "--json", tmp_path / "run.json")
     assert ran.exit_code == 0, ran.output
-    assert json.loads((tmp_path / "run.json").read_text())["combinations"][0]["num_rendered"] == 4
+    assert json.loads((tmp_path / "run.json").read_text())["combinations"][0]["num_rendered"] == 6
     written = invoke("dataset", batch, "--store", store, "--output", tmp_path / "dataset")
     assert written.exit_code == 0, written.output
-    assert "2 frames of 1 variants (1 train, 0 valid, 1 test)" in written.output
-    assert "0 of 4 frames rendered" in written.output
+    assert "3 frames of 1 variants (1 train, 1 valid, 1 test)" in written.output
+    assert "0 of 6 frames rendered" in written.output
 
 
 def test_failed_combination_leaves_the_others_and_exit_code_1(tmp_path: Path) -> None:
@@ -52,7 +52,7 @@ def test_failed_combination_leaves_the_others_and_exit_code_1(tmp_path: Path) ->
                     tmp_path / "dataset")  # fmt: skip
     assert result.exit_code == 1
     assert "1 of 2 combinations complete" in result.output and "none.xml" in result.output
-    assert len(json.loads((tmp_path / "dataset" / "manifest.json").read_text())["frames"]) == 2
+    assert len(json.loads((tmp_path / "dataset" / "manifest.json").read_text())["frames"]) == 3
 
 
 def test_dataset_of_one_scene_by_file_and_by_its_name_in_the_store(tmp_path: Path) -> None:
@@ -62,12 +62,12 @@ def test_dataset_of_one_scene_by_file_and_by_its_name_in_the_store(tmp_path: Pat
     assert result.exit_code == 0, result.output
     opened = Store.open(store)
     (entry,) = opened.scenes()
-    settings = Settings.preset_named("tiny").override(dict(part.split("=") for part in SMALL[1:10:2]))
+    settings = Settings.preset_named("tiny").override(dict(part.split("=") for part in SMALL[1:8:2]))
     settings = settings.override({"width": 16, "height": 16})
     opened.register_scene(entry["digest"], {**entry, "settings": settings.to_json()})
     again = invoke("dataset", "--scene", "tiny", "--inputs", "none", "--store", store, "--output", tmp_path / "b")
     assert again.exit_code == 0, again.output
-    assert "0 of 2 frames rendered" in again.output
+    assert "0 of 3 frames rendered" in again.output
     frames = [json.loads((tmp_path / name / "manifest.json").read_text())["frames"] for name in "ab"]
     assert [frame["images"] for frame in frames[0]] == [frame["images"] for frame in frames[1]]
 
