@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from service.batch_cli import batch_app, dataset
+from service.export_cli import export
 from service.failures import reported
 from service.jobs_cli import jobs_app
 from service.options import check_writable, parse_look_at, parse_overrides, parse_size
@@ -25,6 +27,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(jobs_app, name="jobs")
+app.add_typer(batch_app)
 
 SceneArgument = Annotated[
     str,
@@ -304,6 +307,10 @@ def worker(
 
         policy = ThreadPolicy(threads, train_threads or os.cpu_count() or 1)
         run_worker(scheduler, threads=policy, name=name, memory_limit=memory_limit, folder=folder)
+
+
+app.command()(dataset)
+app.command()(export)
 
 
 def main() -> None:

@@ -66,3 +66,7 @@ class FrameError(StorageError, ValueError):
 
 class WeightsError(StorageError, ValueError):
     """Weights or a checkpoint cannot be encoded, or bytes are not what they should be."""
+
+
+class DatasetError(StorageError, ValueError):
+    """A folder is no dataset of ours, or its files are not what its manifest says."""

@@ -2,6 +2,8 @@
 about it.
 
 load_scene("scene.xml") | load_scene("scene.yaml") | load_scene("chair.glb") | load_scene("tabletop")
+
+A source may end in a variation, "tabletop#seed=3,materials=0.5" (`workers/variation.py`).
 """
 
 import hashlib
@@ -32,8 +34,10 @@ from workers.scene_nodes import (
     sensor_pose,
     set_film_size,
 )
+from workers.scene_variation import content_of, vary_scene
 from workers.scene_xml import read_xml
 from workers.scene_yaml import YAML_SUFFIXES, read_yaml
+from workers.variation import Variation, split_source
 from workers.world_frame import OWN, WorldFrame, dim_lights, move_nodes, suitable_frame
 
 DIGEST_VERSION = 1
@@ -59,6 +63,7 @@ class Scene:
         settings: overrides of the run's settings that the scene file asks for.
         source: what `load_scene` was given.
         frame: where `mi_scene` lies; cameras, bounds and clip distances here are in the file's own frame.
+        variation: parameters and changes of a varied scene; empty otherwise.
     """
 
     name: str
@@ -74,6 +79,7 @@ class Scene:
     settings: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     source: str
     frame: WorldFrame = OWN
+    variation: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
 
     @property
     def bounds_centre(self) -> np.ndarray:
@@ -118,7 +124,7 @@ def load_scene(source: str | Path, *, width: int | None = None, height: int | No
 
     Args:
         source: path of a Mitsuba XML, a YAML or a mesh file, or the name of a built-in scene
-            ("tabletop", "tiny", also "builtin:tabletop").
+            ("tabletop", "tiny", also "builtin:tabletop"); with a variation after a "#".
         width: image width in pixels; default: the scene's film, or from `height` and the film's aspect.
         height: image height in pixels, likewise.
         max_depth: replaces the longest path of the file's integrator, in edges; -1 is unlimited.
@@ -126,15 +132,18 @@ def load_scene(source: str | Path, *, width: int | None = None, height: int | No
     Raises:
         SceneError: the scene is missing, broken, or asks for what caches cannot represent.
         CameraError: the image size is not usable.
+        VariationError: what follows a "#" is no variation.
     """
     for option, size in (("width", width), ("height", height)):
         if size is not None and size < 1:
             raise SceneError(f"image {option} must be at least 1 pixel, got {size}")
-    parsed = _parse(source, width, height)
+    base, variation = split_source(source)
+    parsed = _parse(base, width, height)
     draft, pixels = parsed.draft, parsed.pixels
     file_depth = path_max_depth(draft.state)
     depth = _checked_depth(file_depth if max_depth is None else max_depth)
-    mi_scene, frame = _built(draft, lambda: _parse(source, width, height).draft)
+    mi_scene, frame = _built(draft, lambda: _parse(base, width, height).draft)
+    varied = _vary(mi_scene, draft, variation)
     notes = [*draft.notes, *check_scene(mi_scene, draft.what)]
     if not frame.is_own:
         notes.append(frame.describe())
@@ -144,8 +153,8 @@ def load_scene(source: str | Path, *, width: int | None = None, height: int | No
         assert draft.make_camera is not None
         camera = draft.make_camera(*pixels)
     near, far = _clip_distances(mi_scene, frame, camera, parsed.sensor)
-    return Scene(
-        name=parsed.name,
+    scene = Scene(
+        name=f"{parsed.name}-v{variation.tag}" if variation and variation.changes_something else parsed.name,
         digest=_digest(draft, frame, depth if depth != file_depth else None),
         mi_scene=mi_scene,
         camera=camera,
@@ -158,7 +167,24 @@ def load_scene(source: str | Path, *, width: int | None = None, height: int | No
         settings=MappingProxyType(draft.settings),
         source=str(source),
         frame=frame,
+        variation=MappingProxyType(varied),
     )
+    return _with_varied_views(scene, variation) if variation else scene
+
+
+def _vary(mi_scene: Any, draft: SceneDraft, variation: Variation | None) -> dict[str, Any]:
+    """Applies a variation to the built scene and to what its digest is made from."""
+    if variation is None:
+        return {}
+    changes = vary_scene(mi_scene, variation)
+    draft.content += content_of(changes, variation)
+    return {**variation.to_json(), "changes": changes}
+
+
+def _with_varied_views(scene: Scene, variation: Variation) -> Scene:
+    from workers.camera_variation import vary_cameras  # it casts rays into a Scene: this module comes first
+
+    return vary_cameras(scene, variation)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from models.network import FusionNet, NetworkConfig
 from models.perceptual import MIN_SIZE_PX, StLpips
 from models.transfer import Transfer
 from storage.perceptual_weights import find_stlpips
-from storage.store import UnitRef
+from storage.store import Store, UnitRef
 from storage.weights import decode_checkpoint, decode_network, encode_checkpoint, encode_network
 from workers.errors import StoppedError, WorkerError
 from workers.inputs import load_inputs
@@ -93,7 +93,11 @@ def run_train(run: RunState, train: tuple[list[UnitRef], list[UnitRef]],
 
 def load_network(run: RunState, ref: UnitRef) -> tuple[FusionNet, Encoding]:
     """Reads a trained network."""
-    store = run.store
+    return read_network(run.store, ref)
+
+
+def read_network(store: Store, ref: UnitRef) -> tuple[FusionNet, Encoding]:
+    """Reads a trained network; the scene itself is not needed."""
     state, config = decode_network(store.read(ref, WEIGHTS_FILE), store.read(ref, CONFIG_FILE))
     values = config["network"]
     network = FusionNet(NetworkConfig(**{**values, "widths": tuple(values["widths"])}))
