@@ -40,7 +40,7 @@ def verify_store(store: "Store") -> list[str]:
             path = store.files.path(layout.scene_folder(digest))
             problems.append(f"{path} is no registered scene; submit the scene again")
         for stage in names:
-            if stage != layout.SCENE_FILE and layout.is_segment(stage):
+            if stage not in (layout.SCENE_FILE, layout.TRADEOFF_FILE) and layout.is_segment(stage):
                 problems += _stage_problems(store, digest, stage)
     return problems
 

@@ -1,6 +1,7 @@
 """Frames of a prepared scene: what the service asks for."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,9 +44,10 @@ class Frame:
 class FrameRenderer:
     """Caches, query program and network of one scene, ready for any camera pose."""
 
-    def __init__(self, program: QueryProgram, reconstructor: Reconstructor) -> None:
+    def __init__(self, program: QueryProgram, reconstructor: Reconstructor, run: RunState | None = None) -> None:
         self.program = program
         self.reconstructor = reconstructor
+        self.run = run  # what it was opened from
 
     @classmethod
     def open(
@@ -70,27 +72,34 @@ class FrameRenderer:
         elements = run_elements(run)
         program = QueryProgram(run.scene.mi_scene, run.table, elements, load_caches(run, elements), run.settings.query)
         precision = run.settings.train.precision
-        renderer = cls(program, Reconstructor(network, encoding, precision=precision, compile=compile))
+        renderer = cls(program, Reconstructor(network, encoding, precision=precision, compile=compile), run)
         if warm_up:
             renderer.render(run.scene.camera.resized(run.settings.width, run.settings.height))
         return renderer
 
     def render(self, camera: Camera) -> Frame:
         """Reconstructs the frame of a camera; any pose is answered."""
-        start = time.perf_counter()
-        features = self.program.run(camera)
-        queried = time.perf_counter()
-        with pool_at_rest():
-            radiance = self.reconstructor(features)
-        finished = time.perf_counter()
-        a, b = CHANNELS["coverage"]
-        return Frame(
-            radiance=radiance,
-            seconds={"query": queried - start, "network": finished - queried},
-            coverage=float(np.mean(features[..., a:b])),
-            exposure=self.reconstructor.encoding.exposure,
-            non_finite=int(radiance.size - np.isfinite(radiance).sum()),
-        )
+        return make_frame(self.program, self.reconstructor, self.reconstructor.encoding.exposure, camera)
+
+
+def make_frame(
+    program: QueryProgram, reconstruct: Callable[[np.ndarray], np.ndarray], exposure: float, camera: Camera
+) -> Frame:
+    """Queries a camera and turns the features into its frame."""
+    start = time.perf_counter()
+    features = program.run(camera)
+    queried = time.perf_counter()
+    with pool_at_rest():
+        radiance = reconstruct(features)
+    finished = time.perf_counter()
+    a, b = CHANNELS["coverage"]
+    return Frame(
+        radiance=radiance,
+        seconds={"query": queried - start, "network": finished - queried},
+        coverage=float(np.mean(features[..., a:b])),
+        exposure=exposure,
+        non_finite=int(radiance.size - np.isfinite(radiance).sum()),
+    )
 
 
 def publish(run: RunState, network_ref: UnitRef, psnr: float | None) -> None:
