@@ -6,17 +6,14 @@ elements, caches and networks come from the store where it has them, and stay th
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 
-from storage.store import Store, UnitRef
-from workers.ablation import bake_cost, training_exposure
+from storage.store import Store
 from workers.backend import dr
 from workers.camera import Camera
-from workers.element_stage import run_elements
 from workers.evaluate import (
     Reference,
     commit,
@@ -30,47 +27,22 @@ from workers.evaluate import (
 from workers.operating_points import FrameTime, OperatingPoint
 from workers.operating_table import OperatingTable, save_table
 from workers.pareto import pareto_front
-from workers.point_renderer import PointParts, Reconstruct, derived_run
+from workers.point_renderer import derived_run
 from workers.progress import Progress
-from workers.query import QueryProgram
 from workers.reconstruct import Reconstructor
 from workers.render import run_render
-from workers.renderer import FrameRenderer, make_frame, publish
+from workers.renderer import FrameRenderer, publish
 from workers.run_state import RunState
 from workers.scene import Scene
 from workers.settings import Settings
 from workers.timing import interleaved_medians, other_load
-from workers.tradeoff_variants import (
-    SweepVariant,
-    TradeoffBudget,
-    affordable,
-    bake_variant,
-    sweep_variants,
-    train_variant,
-    trained,
-)
-from workers.train import WEIGHTS_FILE, load_network
+from workers.tradeoff_preparation import PreparedVariant, base_run, network_ref, prepare_variants
+from workers.tradeoff_variants import TradeoffBudget
+from workers.train import load_network
 
 Method = Callable[[Camera, int], np.ndarray]
 COSTS = ("ms", "bake_seconds", "nbytes")
 ERRORS = ("psnr", "flip", "temporal")
-
-
-@dataclass
-class _Prepared:
-    """A variant with its caches baked and its network trained."""
-
-    variant: SweepVariant
-    network: str | None
-    precision: str
-    program: QueryProgram
-    reconstruct: Reconstruct
-    costs: dict[str, Any]
-    exposure: float
-
-    def render(self, camera: Camera, index: int = 0) -> np.ndarray:
-        del index
-        return make_frame(self.program, self.reconstruct, self.exposure, camera).radiance
 
 
 def run_tradeoff(
@@ -81,19 +53,22 @@ def run_tradeoff(
     A scene that was never run is published with the sweep's base, so that it can be served.
 
     Returns:
-        The table that is also kept in the store; its result's rows are as `_finish_rows` leaves them.
+        The table that is also kept in the store; its result's "rows" are evaluation
+        rows with "kind", costs, "times" and fronts (`mark_fronts`).
     """
     budget = budget or TradeoffBudget()
     torch.set_num_threads(dr.thread_count())
     known = next((entry for entry in store.scenes() if entry["digest"] == scene.digest), None)
     if known is None:
         store.register_scene(scene.digest, {"name": scene.name, "source": str(scene.source)})
-    base = _base_run(RunState(scene, store, settings, progress), budget)
-    prepared = _prepare_all(base, budget)
+    base = base_run(RunState(scene, store, settings, progress), budget)
+    prepared = prepare_variants(base, budget)
     test_refs = run_render(base, base.paths.test, base.settings.frames.test_spp, "render test references")
     reference = load_reference(base, test_refs, prepared[0].exposure)
-    methods = _methods(base, prepared, budget)
-    rows = _score(base, methods, reference, prepared[0])
+    network, encoding = load_network(base, network_ref(base, str(prepared[0].network)))
+    renderer = FrameRenderer(prepared[0].program, Reconstructor(network, encoding))
+    methods = _methods(base, renderer, prepared, budget)
+    rows = _score(base, renderer, methods, reference)
     with other_load() as load:
         times = _times(base, prepared, methods, budget)
     table = _table(base, budget, prepared, rows, times, reference, load)
@@ -101,112 +76,34 @@ def run_tradeoff(
     if known is None or "network" not in known:
         network = prepared[0].network
         assert network is not None  # the base always has one
-        publish(base, _network_ref(base, network), rows[0]["psnr"])
+        publish(base, network_ref(base, network), rows[0]["psnr"])
     return table
-
-
-def _base_run(run: RunState, budget: TradeoffBudget) -> RunState:
-    """The run as it was trained, or with training that the budget affords."""
-    return run if trained(run) is not None else derived_run(run, affordable(run.settings, budget))
-
-
-# ------------------------------------------------ preparation ------------------------------------------------
-
-
-def _prepare_all(base: RunState, budget: TradeoffBudget) -> list[_Prepared]:
-    parts, prepared = PointParts(base), list[_Prepared]()
-    variants = sweep_variants(base.settings, budget)
-    with base.progress.track("sweep", len(variants)) as advance:
-        for variant in variants:
-            made = _prepare(base, parts, variant, prepared[0] if prepared else None, budget)
-            if made is not None:
-                prepared.append(made)
-            advance(note=variant.name)
-    return prepared
-
-
-def _prepare(
-    base: RunState, parts: PointParts, variant: SweepVariant, first: _Prepared | None, budget: TradeoffBudget
-) -> _Prepared | None:
-    """None where the variant cannot be had: bf16 that strays from fp32."""
-    settings = base.settings.override(variant.overrides)
-    run = derived_run(base, settings)
-    bake_variant(run)
-    program = parts.program(variant.overrides)
-    network = first.network if first and variant.network == "base" else None
-    if variant.network == "own":
-        if first is not None:
-            run = derived_run(base, affordable(settings, budget))
-        network = train_variant(run, program).key
-    precision, exposure = "fp32", first.exposure if first else 0.0
-    if network is not None:
-        precision = _resolved(base, program, network, variant)
-        if variant.precision == "bf16" and precision != "bf16":
-            base.progress.message("bf16 strays from fp32 on this network: no operating point uses it")
-            return None
-    reconstruct = parts.reconstruct(network, precision, variant.scale)
-    if first is None:
-        exposure = _encoding_exposure(base, network)
-    return _Prepared(variant, network, precision, program, reconstruct, _costs(run, network), exposure)
-
-
-def _encoding_exposure(base: RunState, network: str | None) -> float:
-    if network is None:
-        frames = base.settings.frames
-        return training_exposure(base, run_render(base, base.paths.train, frames.train_spp, "render training frames"))
-    return load_network(base, _network_ref(base, network))[1].exposure
-
-
-def _network_ref(run: RunState, key: str) -> UnitRef:
-    return UnitRef(run.scene.digest, "train", key)
-
-
-def _resolved(base: RunState, program: QueryProgram, network: str, variant: SweepVariant) -> str:
-    """The precision that is measured fastest at the run's size, where the variant leaves it open."""
-    if variant.precision == "fp32":
-        return "fp32"
-    loaded, encoding = load_network(base, _network_ref(base, network))
-    chooser = Reconstructor(loaded, encoding, precision=variant.precision)
-    camera = base.paths.test[0]
-    chooser(program.run(camera))
-    return chooser.choices[f"{camera.width}x{camera.height}"]
-
-
-def _costs(run: RunState, network: str | None) -> dict[str, Any]:
-    """Bake seconds and paths, bytes at rest, and seconds of training, from the store's records."""
-    baked = bake_cost(run, run_elements(run))
-    costs = {"bake_seconds": baked["bake_seconds"], "bake_paths": baked["bake_paths"],
-             "nbytes": int(baked["cache_nbytes"]), "train_seconds": None}  # fmt: skip
-    if network is not None:
-        ref = _network_ref(run, network)
-        costs["nbytes"] += len(run.store.read(ref, WEIGHTS_FILE))
-        costs["train_seconds"] = float((run.store.committed(ref) or {}).get("seconds", 0.0))
-    return costs
 
 
 # ------------------------------------------------ measurement ------------------------------------------------
 
 
-def _methods(base: RunState, prepared: list[_Prepared], budget: TradeoffBudget) -> dict[str, Method]:
+def _methods(
+    base: RunState, renderer: FrameRenderer, prepared: list[PreparedVariant], budget: TradeoffBudget
+) -> dict[str, Method]:
     """Every row's function from camera and frame index to radiance."""
     compared = derived_run(base, base.settings.override({"evaluation.spp": budget.spp}))
-    network, encoding = load_network(base, _network_ref(base, str(prepared[0].network)))
-    renderer = FrameRenderer(prepared[0].program, Reconstructor(network, encoding))
     others = compared_methods(compared, renderer)
     methods: dict[str, Method] = {one.variant.name: one.render for one in prepared}
     return methods | {name: method for name, method in others.items() if name not in ("ours", "ir")}
 
 
-def _score(base: RunState, methods: dict[str, Method], reference: Reference, first: _Prepared) -> list[dict[str, Any]]:
+def _score(
+    base: RunState, renderer: FrameRenderer, methods: dict[str, Method], reference: Reference
+) -> list[dict[str, Any]]:
     cameras, perceptual = base.paths.test, find_perceptual()
-    network, encoding = load_network(base, _network_ref(base, str(first.network)))
-    renderer = FrameRenderer(first.program, Reconstructor(network, encoding))
+    exposure = renderer.reconstructor.encoding.exposure
     positions = [positions_of(renderer, camera) for camera in cameras]
     rows = []
     with base.progress.track("score", len(methods)) as advance:
         for name, method in methods.items():
             frames = [method(camera, index) for index, camera in enumerate(cameras)]
-            rows.append(score_row(name, frames, reference.frames, first.exposure, perceptual, cameras, positions, 0.0))
+            rows.append(score_row(name, frames, reference.frames, exposure, perceptual, cameras, positions, 0.0))
             advance(note=name)
     return rows
 
@@ -214,7 +111,9 @@ def _score(base: RunState, methods: dict[str, Method], reference: Reference, fir
 Times = dict[str, dict[tuple[int, int], float]]
 
 
-def _times(base: RunState, prepared: list[_Prepared], methods: dict[str, Method], budget: TradeoffBudget) -> Times:
+def _times(
+    base: RunState, prepared: list[PreparedVariant], methods: dict[str, Method], budget: TradeoffBudget
+) -> Times:
     """Median milliseconds by row and size: all rows at the run's own size, ours at the others too."""
     own = (base.settings.width, base.settings.height)
     times: Times = {name: {} for name in methods}
@@ -236,7 +135,7 @@ def _times(base: RunState, prepared: list[_Prepared], methods: dict[str, Method]
 
 
 def _table(
-    base: RunState, budget: TradeoffBudget, prepared: list[_Prepared], rows: list[dict[str, Any]], times: Times,
+    base: RunState, budget: TradeoffBudget, prepared: list[PreparedVariant], rows: list[dict[str, Any]], times: Times,
     reference: Reference, load: dict[str, float],
 ) -> OperatingTable:  # fmt: skip
     own = (base.settings.width, base.settings.height)
@@ -264,7 +163,7 @@ def _table(
     return OperatingTable(base=settings.to_json(), points=tuple(points), result=result)
 
 
-def _point(one: _Prepared, row: dict[str, Any]) -> OperatingPoint:
+def _point(one: PreparedVariant, row: dict[str, Any]) -> OperatingPoint:
     times = tuple(FrameTime(**time) for time in row["times"])
     return OperatingPoint(
         name=row["name"], overrides=_listed(one.variant.overrides), network=one.network, precision=one.precision,
