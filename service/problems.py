@@ -13,6 +13,7 @@ from models.errors import ModelError
 from service import errors
 from storage.errors import StorageError
 from workers.errors import CameraError, WorkerError
+from workers.operating_points import NoOperatingPointsError, UnreachableError
 
 PROBLEM = "application/problem+json"
 log = logging.getLogger("lightwell.service")
@@ -22,7 +23,9 @@ STATUS_OF_ERROR: dict[type[Exception], int] = {
     errors.NotAcceptableError: 406,
     errors.AmbiguousSceneError: 409,
     errors.FrameTooLargeError: 413,
+    NoOperatingPointsError: 404,
     CameraError: 422,
+    UnreachableError: 422,
     errors.ServiceError: 500,
     WorkerError: 500,
     StorageError: 500,
@@ -43,7 +46,8 @@ def _known_error(_: Request, error: Exception) -> JSONResponse:
     detail = " ".join(str(error).split()) or "not enough memory for this frame; choose a smaller size"
     if status >= 500:
         log.error("%s: %s", type(error).__name__, detail)
-    return problem(status, detail)
+    extra = {"reachable": error.reachable} if isinstance(error, UnreachableError) else {}
+    return problem(status, detail, **extra)
 
 
 def _invalid_request(_: Request, error: Exception) -> JSONResponse:
