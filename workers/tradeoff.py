@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from storage.keys import plain
 from storage.store import Store
 from workers.backend import dr
 from workers.camera import Camera
@@ -160,21 +161,16 @@ def _table(
         "network_seconds": budget.network_seconds, "machine": machine(), "commit": commit(), "load": load,
         "notes": _notes(budget, refused, reference),
     }  # fmt: skip
-    return OperatingTable(base=settings.to_json(), points=tuple(points), result=result)
+    return OperatingTable(base=plain(settings.to_json(), "settings"), points=tuple(points), result=result)
 
 
 def _point(one: PreparedVariant, row: dict[str, Any]) -> OperatingPoint:
     times = tuple(FrameTime(**time) for time in row["times"])
     return OperatingPoint(
-        name=row["name"], overrides=_listed(one.variant.overrides), network=one.network, precision=one.precision,
+        name=row["name"], overrides=plain(one.variant.overrides, "overrides"), network=one.network, precision=one.precision,
         scale=one.variant.scale, psnr=row["psnr"], flip=row["flip"], temporal=row["temporal"], times=times,
         bake_seconds=row["bake_seconds"], nbytes=row["nbytes"],
     )  # fmt: skip
-
-
-def _listed(overrides: dict[str, Any]) -> dict[str, Any]:
-    """Tuples as lists, as they come back from JSON: a point equals itself at rest."""
-    return {key: list(value) if isinstance(value, tuple) else value for key, value in overrides.items()}
 
 
 def _notes(budget: TradeoffBudget, refused: list[str], reference: Reference) -> list[str]:
