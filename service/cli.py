@@ -1,5 +1,6 @@
 """The `lightwell` command. Mitsuba and torch are imported inside the commands: --help answers at once."""
 
+import dataclasses
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -210,14 +211,15 @@ def tradeoff(
         if plot_file is not None:
             plot_suffix(plot_file)
             check_writable(plot_file, "--plot")
-        timed = {"sizes": tuple(map(parse_size, sizes))} if sizes else {}
         from service.progress import RichProgress
         from service.table import show
         from storage.store import Store
         from workers.tradeoff import run_tradeoff
         from workers.tradeoff_variants import TradeoffBudget
 
-        budget = TradeoffBudget(network_seconds=network_seconds, repeats=repeats, paper=paper, **timed)
+        budget = TradeoffBudget(network_seconds=network_seconds, repeats=repeats, paper=paper)
+        if sizes:
+            budget = dataclasses.replace(budget, sizes=tuple(map(parse_size, sizes)))
         loaded = _load(scene, resolution)
         settings = _settings(preset, loaded, assignments)
         with RichProgress() as progress:

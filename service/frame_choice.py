@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, cast
 if TYPE_CHECKING:
     from storage.store import Store
     from workers.camera import Camera
-    from workers.operating_points import Choice, Quality
+    from workers.operating_points import Choice, OperatingPoint, Quality
     from workers.renderer import Frame
 
 
@@ -71,12 +71,12 @@ def render_chosen(store: "Store", scene: str, camera: "Camera", demand: Demand) 
     return PointRenderer.open(store, digest, warm_up=False).render(camera, choice.point), choice
 
 
-def choice_headers(choice: "Choice | None") -> dict[str, str]:
-    """How an answer names its point."""
-    if choice is None:
+def point_headers(point: "OperatingPoint | None", width: int, height: int) -> dict[str, str]:
+    """How an answer names its point; none where the published run made the frame."""
+    if point is None:
         return {}
     return {
-        "X-Lightwell-Point": choice.point.name,
-        "X-Lightwell-Point-Ms": f"{choice.ms:.2f}",
-        "X-Lightwell-Point-PSNR": f"{choice.point.psnr:.2f}",
+        "X-Lightwell-Point": point.name,
+        "X-Lightwell-Point-Ms": f"{point.predicted_ms(width, height):.2f}",
+        "X-Lightwell-Point-PSNR": f"{point.psnr:.2f}",
     }

@@ -12,8 +12,7 @@ from starlette.exceptions import HTTPException
 from models.errors import ModelError
 from service import errors
 from storage.errors import StorageError
-from workers.errors import CameraError, WorkerError
-from workers.operating_points import NoOperatingPointsError, UnreachableError
+from workers.errors import CameraError, NoOperatingPointsError, UnreachableError, WorkerError
 
 PROBLEM = "application/problem+json"
 log = logging.getLogger("lightwell.service")

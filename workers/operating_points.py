@@ -13,37 +13,17 @@ of other machines, or of a machine that does other work meanwhile. PSNR is that 
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, get_args
 
 import numpy as np
 from scipy.optimize import nnls
 
-from workers.errors import WorkerError
+from workers.errors import NoOperatingPointsError, OperatingPointError, UnreachableError
 
 BALANCED_DB = 1.0  # "balanced" is the fastest point that loses at most this much to the best
 Quality = Literal["draft", "balanced", "best"]
 QUALITIES: tuple[str, ...] = get_args(Quality)
-
-
-class OperatingPointError(WorkerError, ValueError):
-    """A demand is no demand, or a scene's table cannot be read."""
-
-
-class NoOperatingPointsError(OperatingPointError):
-    """The scene's trade was never measured, or no longer fits the scene's run."""
-
-
-class UnreachableError(OperatingPointError):
-    """No measured point meets the demand.
-
-    Attributes:
-        reachable: what comes nearest: "fastest" and "best", each {"point", "ms", "psnr"}.
-    """
-
-    def __init__(self, message: str, reachable: dict[str, dict[str, Any]]) -> None:
-        super().__init__(message)
-        self.reachable = reachable
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +53,7 @@ class OperatingPoint:
     """
 
     name: str
-    overrides: dict[str, Any]
+    overrides: dict[str, Any] = field(hash=False)
     network: str | None
     precision: str
     scale: int

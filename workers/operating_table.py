@@ -7,7 +7,8 @@ from typing import Any
 
 from storage.layout import tradeoff_file
 from storage.store import Store
-from workers.operating_points import NoOperatingPointsError, OperatingPoint, OperatingPointError
+from workers.errors import NoOperatingPointsError, OperatingPointError
+from workers.operating_points import OperatingPoint
 
 SCHEMA = 1
 

@@ -11,7 +11,8 @@ from workers.bake import bake_refs, load_caches
 from workers.camera import Camera
 from workers.element_stage import elements_ref, run_elements
 from workers.elements import ElementSet
-from workers.operating_points import OperatingPoint, OperatingPointError
+from workers.errors import OperatingPointError
+from workers.operating_points import OperatingPoint
 from workers.operating_table import OperatingTable, load_table
 from workers.query import CHANNELS, CacheArrays, QueryProgram
 from workers.reconstruct import Reconstructor

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -53,7 +53,7 @@ class FrameRenderer:
     def open(
         cls, store: Store, scene_name: str, *, progress: Progress | None = None, compile: bool = False,
         warm_up: bool = True,
-    ) -> "FrameRenderer":  # fmt: skip
+    ) -> Self:  # fmt: skip
         """Loads what `run_scene` prepared.
 
         Args:

@@ -66,8 +66,8 @@ def run_tradeoff(
     prepared = prepare_variants(base, budget)
     test_refs = run_render(base, base.paths.test, base.settings.frames.test_spp, "render test references")
     reference = load_reference(base, test_refs, prepared[0].exposure)
-    network, encoding = load_network(base, network_ref(base, str(prepared[0].network)))
-    renderer = FrameRenderer(prepared[0].program, Reconstructor(network, encoding))
+    network_key = str(prepared[0].network)  # the base always has one
+    renderer = FrameRenderer(prepared[0].program, Reconstructor(*load_network(base, network_ref(base, network_key))))
     methods = _methods(base, renderer, prepared, budget)
     rows = _score(base, renderer, methods, reference)
     with other_load() as load:
@@ -75,9 +75,7 @@ def run_tradeoff(
     table = _table(base, budget, prepared, rows, times, reference, load)
     save_table(store, scene.digest, table)
     if known is None or "network" not in known:
-        network = prepared[0].network
-        assert network is not None  # the base always has one
-        publish(base, network_ref(base, network), rows[0]["psnr"])
+        publish(base, network_ref(base, network_key), rows[0]["psnr"])
     return table
 
 
@@ -167,9 +165,9 @@ def _table(
 def _point(one: PreparedVariant, row: dict[str, Any]) -> OperatingPoint:
     times = tuple(FrameTime(**time) for time in row["times"])
     return OperatingPoint(
-        name=row["name"], overrides=plain(one.variant.overrides, "overrides"), network=one.network, precision=one.precision,
-        scale=one.variant.scale, psnr=row["psnr"], flip=row["flip"], temporal=row["temporal"], times=times,
-        bake_seconds=row["bake_seconds"], nbytes=row["nbytes"],
+        name=row["name"], overrides=plain(one.variant.overrides, "overrides"), network=one.network,
+        precision=one.precision, scale=one.variant.scale, psnr=row["psnr"], flip=row["flip"],
+        temporal=row["temporal"], times=times, bake_seconds=row["bake_seconds"], nbytes=row["nbytes"],
     )  # fmt: skip
 
 

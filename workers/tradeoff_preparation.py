@@ -103,10 +103,10 @@ def _resolved(base: RunState, program: QueryProgram, network: str, variant: Swee
 def _costs(run: RunState, network: str | None) -> dict[str, Any]:
     """Bake seconds and paths, bytes at rest, and seconds of training, from the store's records."""
     baked = bake_cost(run, run_elements(run))
-    costs = {"bake_seconds": baked["bake_seconds"], "bake_paths": baked["bake_paths"],
-             "nbytes": int(baked["cache_nbytes"]), "train_seconds": None}  # fmt: skip
+    nbytes, train_seconds = int(baked["cache_nbytes"]), None
     if network is not None:
         ref = network_ref(run, network)
-        costs["nbytes"] += len(run.store.read(ref, WEIGHTS_FILE))
-        costs["train_seconds"] = float((run.store.committed(ref) or {}).get("seconds", 0.0))
-    return costs
+        nbytes += len(run.store.read(ref, WEIGHTS_FILE))
+        train_seconds = float((run.store.committed(ref) or {}).get("seconds", 0.0))
+    return {"bake_seconds": baked["bake_seconds"], "bake_paths": baked["bake_paths"], "nbytes": nbytes,
+            "train_seconds": train_seconds}  # fmt: skip

@@ -54,32 +54,41 @@ def joint_bilateral_upsample(
         low_guide: the same at half the resolution (`halve`).
         demodulate: average radiance per unit of reflectance.
     """
-    full, low = (pad_to_multiple(guide, SCALE), low_guide)
+    full = pad_to_multiple(guide, SCALE)
     height, width = guide.shape[-2:]
-    source = radiance / low[:, 3:6].clamp(min=MIN_ALBEDO) if demodulate else radiance
-    own = full[:, 3:6].clamp(min=MIN_ALBEDO)
     result = torch.empty((1, 3, *full.shape[-2:]), dtype=radiance.dtype, device=radiance.device)
-    low_padded, source_padded, radiance_padded = (F.pad(x, (1, 1, 1, 1), mode="replicate")
-                                                  for x in (low, source, radiance))  # fmt: skip
-    # The four pixels of a block see different neighbours, but each of the four kinds sees one shift of the image.
+    padded_guide, padded = (F.pad(x, (1, 1, 1, 1), mode="replicate") for x in (low_guide, radiance))
+    # The four pixels of a block see different neighbours, but each of the four kinds sees shifts of one image.
     for y in range(SCALE):
         for x in range(SCALE):
-            pixel = full[..., y::SCALE, x::SCALE]
-            total = torch.zeros_like(radiance)
-            weights = torch.zeros_like(radiance[:, :1])
-            for dy, wy in ((0, 0.75), (2 * y - 1, 0.25)):
-                for dx, wx in ((0, 0.75), (2 * x - 1, 0.25)):
-                    place = (0, slice(None), *(slice(1 + d, 1 + d + n) for d, n in zip((dy, dx), low.shape[-2:],
-                                                                                      strict=True)))  # fmt: skip
-                    weight = _similarity(pixel, low_padded[place][None]).add_(FALLBACK).mul_(wy * wx)
-                    value = source_padded[place][None]
-                    if demodulate:
-                        value = value * own[..., y::SCALE, x::SCALE]
-                        value = torch.minimum(value, MAX_GAIN * radiance_padded[place][None].clamp(min=0.0))
-                    total.addcmul_(value, weight)
-                    weights += weight
-            result[..., y::SCALE, x::SCALE] = total / weights
+            kind = (..., slice(y, None, SCALE), slice(x, None, SCALE))
+            result[kind] = _pixels_of_kind(full[kind], padded_guide, padded, y, x, demodulate)
     return result[..., :height, :width]
+
+
+def _pixels_of_kind(pixel: Tensor, padded_guide: Tensor, padded: Tensor, y: int, x: int, demodulate: bool) -> Tensor:
+    """The pixels at (x, y) of every block: means over the block's own and the three nearest low-resolution pixels.
+
+    Args:
+        pixel: their guide, [1, 7, h, w].
+        padded_guide, padded: guide and radiance at low resolution, one pixel wider on every side.
+        y, x: 0 or 1.
+        demodulate: average radiance per unit of reflectance.
+    """
+    height, width = pixel.shape[-2:]
+    albedo = pixel[:, 3:6].clamp(min=MIN_ALBEDO)
+    total, weights = torch.zeros_like(albedo), torch.zeros_like(albedo[:, :1])
+    for dy, wy in ((0, 0.75), (2 * y - 1, 0.25)):
+        for dx, wx in ((0, 0.75), (2 * x - 1, 0.25)):
+            other, value = (
+                image[..., 1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width] for image in (padded_guide, padded)
+            )
+            if demodulate:
+                value = value * (albedo / other[:, 3:6].clamp(min=MIN_ALBEDO)).clamp_(max=MAX_GAIN)
+            weight = _similarity(pixel, other).add_(FALLBACK).mul_(wy * wx)
+            total.addcmul_(value, weight)
+            weights += weight
+    return total.div_(weights)
 
 
 def _similarity(pixel: Tensor, other: Tensor) -> Tensor:

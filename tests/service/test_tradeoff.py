@@ -16,13 +16,14 @@ from typer.testing import CliRunner
 
 from service.cli import app as command
 from service.errors import OptionError, UnknownSceneError
-from service.frame_choice import Demand, choice_headers, choose_point
+from service.frame_choice import Demand, choose_point, point_headers
 from service.problems import add_problem_handlers
 from service.routes_tradeoff import add_tradeoff_routes, store_tables
 from service.tradeoff import tradeoff_table, write_tradeoff
 from service.tradeoff_plot import plot_suffix, tradeoff_plot
 from storage.store import Store
-from workers.operating_points import FrameTime, NoOperatingPointsError, OperatingPoint, UnreachableError
+from workers.errors import NoOperatingPointsError, UnreachableError
+from workers.operating_points import FrameTime, OperatingPoint
 from workers.operating_table import OperatingTable, save_table
 from workers.renderer import Frame
 from workers.tradeoff import mark_fronts
@@ -144,7 +145,8 @@ def client(store: Store) -> Iterator[TestClient]:
 
     @app.get("/choose")
     def choose(max_ms: float) -> dict[str, str]:
-        return choice_headers(choose_point(store, "d1", Demand(max_ms=max_ms), 100, 100))
+        choice = choose_point(store, "d1", Demand(max_ms=max_ms), 100, 100)
+        return point_headers(choice and choice.point, 100, 100)
 
     with TestClient(app, raise_server_exceptions=False) as client:
         yield client
@@ -179,7 +181,7 @@ def test_unreachable_demand_is_422_and_names_the_nearest(client: TestClient) -> 
 
 def test_choose_point_leaves_an_empty_demand_to_the_published_run(store: Store) -> None:
     assert choose_point(store, "d1", Demand(), 100, 100) is None
-    assert choice_headers(None) == {}
+    assert point_headers(None, 100, 100) == {}
     with pytest.raises(NoOperatingPointsError):
         choose_point(store, "d2", Demand(quality="best"), 100, 100)
     with pytest.raises(UnreachableError):

@@ -9,16 +9,8 @@ from hypothesis import strategies as st
 
 from storage.layout import tradeoff_file
 from storage.store import Store
-from workers.operating_points import (
-    FrameDemand,
-    FrameTime,
-    NoOperatingPointsError,
-    OperatingPoint,
-    OperatingPointError,
-    UnreachableError,
-    choose,
-    time_model,
-)
+from workers.errors import NoOperatingPointsError, OperatingPointError, UnreachableError
+from workers.operating_points import FrameDemand, FrameTime, OperatingPoint, choose, time_model
 from workers.operating_table import OperatingTable, load_table, save_table
 
 SIZES = ((320, 180), (640, 360), (1280, 720))
