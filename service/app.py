@@ -1,57 +1,31 @@
-"""The HTTP service: frames of the scenes of one store.
+"""The HTTP service: frames of the scenes of one store, and how it fares.
 
-    GET  /v1/scenes                  what can be served
-    POST /v1/scenes/{scene}/frame    a frame for a camera, as PNG, JPEG or EXR by Accept
-    GET  /healthz                    the process answers
-
-Errors are problem documents (service/problems.py). Frames are rendered one after the other on one thread
-(service/rendering.py); bounds on the queue, jobs and authentication are not here yet, so listen on loopback.
+Routes are in service/routes_*.py; errors are problem documents (service/problems.py). Frames are rendered one
+after the other on one thread (service/rendering.py). Authentication is not here: listen on loopback.
 """
 
 import asyncio
-import time
-from collections.abc import AsyncIterator, Callable
+import logging
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
-from importlib.metadata import PackageNotFoundError, version
-from typing import Annotated, Any
 
-from fastapi import FastAPI, Header, Response
+from fastapi import FastAPI
 
-from service import images
-from service.problems import PROBLEM, add_problem_handlers
+from service.failures import known_errors, one_line
+from service.metrics import FrameMetrics
+from service.pictures import DEFAULT_QUEUE_LIMIT, DEFAULT_RECENT_NBYTES, Pictures
+from service.problems import add_problem_handlers
 from service.rendering import Backend, RenderThread, StoreBackend
-from service.schemas import DEFAULT_MAX_PIXELS, FrameRequest
+from service.routes_frames import add_frame_routes
+from service.routes_health import Readiness, add_health_routes
+from service.routes_tradeoff import add_tradeoff_routes, store_tables
+from service.scene_cache import DEFAULT_MEMORY_NBYTES
+from service.schemas import DEFAULT_MAX_PIXELS
+from service.version import package_version
 
-_BINARY = {"schema": {"type": "string", "format": "binary"}}
-_PROBLEM_OF_STATUS = {
-    404: "no such scene",
-    406: "Accept allows none of the formats",
-    409: "several scenes have this name",
-    413: "too many pixels",
-    422: "the request or its camera is not valid",
-}
-FRAME_RESPONSES: dict[int | str, dict[str, Any]] = {
-    200: {
-        "description": "the frame; EXR holds linear scene radiance, PNG and JPEG what a screen shows",
-        "content": {media_type: _BINARY for media_type in images.MEDIA_TYPES},
-    },
-    **{
-        status: {"description": description, "content": {PROBLEM: {"schema": {"type": "object"}}}}
-        for status, description in _PROBLEM_OF_STATUS.items()
-    },
-}
-
-
-def server_timing(seconds: dict[str, float]) -> str:
-    """A Server-Timing header's value: "query;dur=12.3, network;dur=4.5", in milliseconds."""
-    return ", ".join(f"{name};dur={1e3 * duration_s:.2f}" for name, duration_s in seconds.items())
-
-
-def _version() -> str:
-    try:
-        return version("lightwell")
-    except PackageNotFoundError:
-        return "0"
+DRAIN_S = 30.0
+"""So long frames under way are waited for at shutdown."""
+log = logging.getLogger("lightwell.service")
 
 
 def create_app(
@@ -59,6 +33,10 @@ def create_app(
     *,
     make_backend: Callable[[], Backend] | None = None,
     max_pixels: int = DEFAULT_MAX_PIXELS,
+    queue_limit: int = DEFAULT_QUEUE_LIMIT,
+    memory_nbytes: int = DEFAULT_MEMORY_NBYTES,
+    recent_nbytes: int = DEFAULT_RECENT_NBYTES,
+    preload: Sequence[str] = (),
 ) -> FastAPI:
     """The service over one store.
 
@@ -66,56 +44,57 @@ def create_app(
         store_url: a folder or fsspec URL that holds a store.
         make_backend: what opens scenes instead of the store; called on the render thread.
         max_pixels: the largest frame that is answered.
+        queue_limit: frames under way at most; more are answered 503.
+        memory_nbytes: of all open scenes together.
+        recent_nbytes: of pictures kept to be sent again.
+        preload: scenes opened before the service is ready.
+
+    Returns:
+        The app; `app.state` has `registry` (of /metrics), `readiness` and `pictures`.
     """
-    rendering = RenderThread(make_backend or (lambda: StoreBackend(store_url)))
+    rendering = RenderThread(
+        make_backend or (lambda: StoreBackend(store_url)), budget_nbytes=memory_nbytes, preload=preload
+    )
+    metrics, readiness = FrameMetrics(), Readiness()
+    pictures = Pictures(rendering, metrics, queue_limit=queue_limit, recent_nbytes=recent_nbytes)
+    pictures.show()
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        warming = None
         try:
             await rendering.start()
+            warming = asyncio.create_task(_warm_up(rendering, readiness))
             yield
+            readiness.stopping()
+            await pictures.drain(DRAIN_S)
         finally:
+            pictures.stop()
+            if warming is not None:
+                warming.cancel()
             rendering.close()
+            pictures.close()
 
     app = FastAPI(
         title="Lightwell",
-        version=_version(),
+        version=package_version(),
         description="Globally lit frames of a 3D scene for any camera pose.",
         lifespan=lifespan,
     )
+    app.state.registry, app.state.readiness, app.state.pictures = metrics.registry, readiness, pictures
     add_problem_handlers(app)
-
-    @app.get("/healthz", summary="The process answers")
-    async def healthz() -> dict[str, str]:
-        return {"status": "ok"}
-
-    @app.get("/v1/scenes", summary="Scenes that can be served")
-    async def list_scenes() -> dict[str, list[dict[str, Any]]]:
-        return {"scenes": await rendering.scenes()}
-
-    @app.post(
-        "/v1/scenes/{scene}/frame",
-        summary="A frame for a camera",
-        response_class=Response,
-        responses=FRAME_RESPONSES,
-    )
-    async def frame(scene: str, request: FrameRequest, accept: Annotated[str | None, Header()] = None) -> Response:
-        media_type = images.negotiate(accept)
-        rendered = await rendering.render(scene, request.to_camera(max_pixels))
-        start_s = time.perf_counter()
-        content = await asyncio.to_thread(images.encode, rendered.radiance, rendered.exposure, media_type)
-        seconds = {**rendered.seconds, "encode": time.perf_counter() - start_s}
-        return Response(
-            content,
-            media_type=media_type,
-            headers={
-                "Server-Timing": server_timing(seconds),
-                "X-Lightwell-Coverage": f"{rendered.coverage:.4f}",
-                "X-Lightwell-Exposure": f"{rendered.exposure:.6g}",
-                "X-Lightwell-Non-Finite": str(rendered.non_finite),
-                "Cache-Control": "no-store",
-                "Vary": "Accept",
-            },
-        )
-
+    add_health_routes(app, readiness, metrics.registry)
+    add_frame_routes(app, pictures, max_pixels=max_pixels)
+    add_tradeoff_routes(app, rendering.catalogue.resolve, store_tables(store_url))
     return app
+
+
+async def _warm_up(rendering: RenderThread, readiness: Readiness) -> None:
+    """Frames that come meanwhile wait behind it; what fails is told by /readyz and the log."""
+    try:
+        await rendering.warm_up()
+    except known_errors() as error:
+        log.error("warm-up: %s", one_line(error))
+        readiness.failed(f"the warm-up failed: {one_line(error)}")
+    else:
+        readiness.ready()

@@ -313,12 +313,16 @@ def serve(
     store: StoreOption,
     host: Annotated[str, typer.Option("--host", help="address to listen on")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0 takes a free one")] = 8000,
+    preload: Annotated[
+        list[str] | None,
+        typer.Option("--preload", help="open this scene before /readyz says ready; may be given again"),
+    ] = None,
 ) -> None:
-    """Answer frame requests over HTTP: POST /v1/scenes/{scene}/frame, GET /v1/scenes, /docs."""
+    """Answer frame requests over HTTP: POST /v1/scenes/{scene}/frame, GET /v1/scenes, /metrics, /docs."""
     with reported():
         from service.serving import serve_store
 
-        serve_store(store, host, port)
+        serve_store(store, host, port, preload or ())
 
 
 def main() -> None:

@@ -15,6 +15,8 @@ from storage.errors import StorageError
 from workers.errors import CameraError, NoOperatingPointsError, UnreachableError, WorkerError
 
 PROBLEM = "application/problem+json"
+CLIENT_GONE = 499
+"""Of a request whose client went away; nobody reads it, access logs show it (nginx's number)."""
 log = logging.getLogger("lightwell.service")
 
 STATUS_OF_ERROR: dict[type[Exception], int] = {
@@ -25,6 +27,10 @@ STATUS_OF_ERROR: dict[type[Exception], int] = {
     NoOperatingPointsError: 404,
     CameraError: 422,
     UnreachableError: 422,
+    errors.ClientGoneError: CLIENT_GONE,
+    errors.NonFiniteFrameError: 500,
+    errors.BusyError: 503,
+    errors.SceneTooLargeError: 507,
     errors.ServiceError: 500,
     WorkerError: 500,
     StorageError: 500,
@@ -36,17 +42,24 @@ STATUS_OF_ERROR: dict[type[Exception], int] = {
 
 def problem(status: int, detail: str, **extra: Any) -> JSONResponse:
     """A problem document; `title` is the status' own phrase, so `type` is about:blank and left out."""
-    content = {"title": HTTPStatus(status).phrase, "status": status, "detail": detail, **extra}
+    title = HTTPStatus(status).phrase if status != CLIENT_GONE else "Client Closed Request"
+    content = {"title": title, "status": status, "detail": detail, **extra}
     return JSONResponse(content, status_code=status, media_type=PROBLEM)
 
 
 def _known_error(_: Request, error: Exception) -> JSONResponse:
+    """Every 503 says when to ask again; being busy is no failure and fills no log."""
     status = next(STATUS_OF_ERROR[kind] for kind in type(error).__mro__ if kind in STATUS_OF_ERROR)
     detail = " ".join(str(error).split()) or "not enough memory for this frame; choose a smaller size"
-    if status >= 500:
+    is_busy = isinstance(error, errors.BusyError)
+    if status >= 500 and not is_busy:
         log.error("%s: %s", type(error).__name__, detail)
-    extra = {"reachable": error.reachable} if isinstance(error, UnreachableError) else {}
-    return problem(status, detail, **extra)
+    extra: dict[str, Any] = {"non_finite": error.non_finite} if isinstance(error, errors.NonFiniteFrameError) else {}
+    extra |= {"reachable": error.reachable} if isinstance(error, UnreachableError) else {}
+    response = problem(status, detail, **extra)
+    if status == 503:
+        response.headers["Retry-After"] = str(error.retry_after_s if isinstance(error, errors.BusyError) else 1)
+    return response
 
 
 def _invalid_request(_: Request, error: Exception) -> JSONResponse:

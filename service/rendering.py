@@ -1,41 +1,56 @@
-"""One thread that owns Dr.Jit: it opens the scenes of a store and answers cameras, one after the other."""
+"""One thread that owns Dr.Jit: it opens the scenes of a store and answers cameras, one after the other.
+
+Dr.Jit's state belongs to the thread that made it, so the scenes that one thread opened are rendered by it alone;
+calls wait in the order in which they came. While a scene is opened (seconds) every other frame waits.
+"""
 
 import asyncio
-from collections import OrderedDict
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+import logging
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-from service.errors import AmbiguousSceneError, UnknownSceneError
+from service.catalogue import Catalogue, Entry
+from service.frame_choice import Demand, choose_point
+from service.scene_cache import DEFAULT_MEMORY_NBYTES, OpenScenes, Renderer, SceneKey
 
 if TYPE_CHECKING:
     from workers.camera import Camera
+    from workers.operating_points import OperatingPoint
     from workers.renderer import Frame
 
 T = TypeVar("T")
-MAX_OPEN_SCENES = 4
-
-
-class Renderer(Protocol):
-    """What answers the cameras of one scene: `workers.renderer.FrameRenderer`, or a test's stand-in."""
-
-    def render(self, camera: "Camera") -> "Frame": ...
+log = logging.getLogger("lightwell.service")
 
 
 class Backend(Protocol):
     """Where scenes come from."""
 
-    def scenes(self) -> list[dict[str, Any]]:
-        """The scenes that can be served, each with at least "name" and "digest"."""
+    def scenes(self) -> list[Entry]:
+        """The scenes that can be served, each with at least "name", "digest" and "network". Called on any thread."""
+        ...
+
+    def warm_up(self) -> None:
+        """Imports and starts what the first scene would otherwise wait for; takes seconds."""
         ...
 
     def open(self, digest: str) -> Renderer:
         """Loads one scene, its caches and its network; takes seconds."""
         ...
 
+    def choose(self, digest: str, demand: Demand, width: int, height: int) -> "OperatingPoint":
+        """The measured point of a scene that meets a demand. Called on any thread."""
+        ...
+
+    def trim(self) -> None:
+        """Gives the memory of closed scenes back to the system."""
+        ...
+
 
 class StoreBackend:
-    """Scenes of a store. Nothing heavy is imported before the first call.
+    """Scenes of a store. Nothing heavy is imported before `warm_up` or `open`.
 
     Args:
         store_url: a folder or fsspec URL that holds a store.
@@ -49,93 +64,133 @@ class StoreBackend:
 
         self._store = Store.open(store_url)
 
-    def scenes(self) -> list[dict[str, Any]]:
-        from workers.renderer import renderable_scenes
+    def scenes(self) -> list[Entry]:
+        from workers.published import renderable_scenes
 
         return renderable_scenes(self._store)
 
+    def warm_up(self) -> None:
+        import workers.point_renderer  # noqa: F401  # starts Mitsuba and torch
+
     def open(self, digest: str) -> Renderer:
-        from workers.renderer import FrameRenderer
+        from workers.point_renderer import PointRenderer
 
-        return FrameRenderer.open(self._store, digest)
+        return PointRenderer.open(self._store, digest)
+
+    def choose(self, digest: str, demand: Demand, width: int, height: int) -> "OperatingPoint":
+        choice = choose_point(self._store, digest, demand, width, height)
+        assert choice is not None  # something is demanded
+        return choice.point
+
+    def trim(self) -> None:
+        from workers.footprint import release_freed
+
+        release_freed()
 
 
-def resolve_scene(scenes: list[dict[str, Any]], name_or_digest: str) -> str:
-    """The digest of the one scene that has this name or digest.
+@dataclass(frozen=True)
+class FrameKey:
+    """Everything that decides a frame: the scene's content, the network that serves it, pose, lens and size; and the
+    measured operating point, None for the published run."""
 
-    Raises:
-        UnknownSceneError: none has it.
-        AmbiguousSceneError: several scenes share the name.
-    """
-    digests = {scene["digest"] for scene in scenes if name_or_digest in (scene["name"], scene["digest"])}
-    if not digests:
-        names = ", ".join(sorted({scene["name"] for scene in scenes})) or "none yet"
-        raise UnknownSceneError(
-            f"scene must be one that this store can serve ({names}), got {name_or_digest!r}; "
-            "'lightwell run SCENE --store DIR' adds one"
-        )
-    if len(digests) > 1:
-        raise AmbiguousSceneError(
-            f"scene must name one scene, got {name_or_digest!r} which {len(digests)} share; "
-            f"give a digest: {', '.join(sorted(digests))}"
-        )
-    return digests.pop()
+    scene: SceneKey
+    camera: "Camera"
+    point: "OperatingPoint | None" = None
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """A frame, and the seconds that it waited for the thread ("queue") and took to open its scene ("open"),
+    query and network."""
+
+    frame: "Frame"
+    seconds: dict[str, float]
 
 
 class RenderThread:
-    """Runs every call of a backend on one thread and keeps the scenes used last open.
-
-    Dr.Jit's state belongs to the thread that made it, so the scenes that one thread opened are rendered by it
-    alone; requests wait in the order in which they came.
+    """The thread, its backend and its open scenes.
 
     Args:
         make_backend: called once, on the render thread.
-        max_open_scenes: the scene used longest ago is closed when one more is opened.
+        budget_nbytes: memory of all open scenes together.
+        preload: names or digests of scenes that are opened before the service is ready.
     """
 
-    def __init__(self, make_backend: Callable[[], Backend], *, max_open_scenes: int = MAX_OPEN_SCENES) -> None:
-        self._make_backend = make_backend
-        self._max_open_scenes = max_open_scenes
+    def __init__(
+        self, make_backend: Callable[[], Backend], *, budget_nbytes: int = DEFAULT_MEMORY_NBYTES,
+        preload: Sequence[str] = (),
+    ) -> None:  # fmt: skip
+        self._make_backend, self._preload = make_backend, tuple(preload)
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="lightwell-render")
+        self._calls: set[Future[Any]] = set()
         self._backend: Backend | None = None
-        self._open: OrderedDict[str, Renderer] = OrderedDict()
-
-    async def _call(self, function: Callable[..., T], *arguments: Any) -> T:
-        return await asyncio.get_running_loop().run_in_executor(self._thread, function, *arguments)
+        self.catalogue = Catalogue(lambda: self._opened_backend().scenes())
+        self.scenes = OpenScenes(
+            lambda digest: self._opened_backend().open(digest),
+            budget_nbytes=budget_nbytes,
+            trim=lambda: self._opened_backend().trim(),
+        )
 
     async def start(self) -> None:
         """Opens the backend, so that a missing store is reported at once."""
-        await self._call(self._get_backend)
+        self._backend = await self._call(self._make_backend)
 
-    async def scenes(self) -> list[dict[str, Any]]:
-        """The scenes that can be served now."""
-        return await self._call(lambda: self._get_backend().scenes())
-
-    async def render(self, scene: str, camera: "Camera") -> "Frame":
-        """A frame of the scene with this name or digest.
+    async def warm_up(self) -> None:
+        """Imports what is heavy and opens the scenes that were asked for.
 
         Raises:
-            UnknownSceneError: no such scene.
-            AmbiguousSceneError: several scenes of that name.
+            UnknownSceneError, AmbiguousSceneError, StorageError, WorkerError: a scene to preload cannot be opened.
         """
-        return await self._call(self._render, scene, camera)
+        await self._call(self._opened_backend().warm_up)
+        for name in self._preload:
+            await self._call(self.scenes.get, scene_key(await self.catalogue.resolve(name)))
+
+    async def choose(self, digest: str, demand: Demand, camera: "Camera") -> "OperatingPoint | None":
+        """The operating point that meets a demand, None where nothing is demanded; beside the thread, not on it.
+
+        Raises:
+            NoOperatingPointsError: the scene's trade was never measured.
+            UnreachableError: no point meets the demand.
+        """
+        if not demand:
+            return None
+        return await asyncio.to_thread(self._opened_backend().choose, digest, demand, camera.width, camera.height)
+
+    async def render(self, key: FrameKey) -> Rendered:
+        """The frame of a key. Cancelled before the thread came to it, it is never begun."""
+        return await self._call(self._render, key, time.perf_counter())
 
     def close(self) -> None:
         """Waits for the frame in progress, drops those that wait."""
         self._thread.shutdown(wait=True, cancel_futures=True)
 
-    def _get_backend(self) -> Backend:
+    @property
+    def num_waiting(self) -> int:
+        """Calls that the thread has not come to."""
+        return sum(not call.running() for call in tuple(self._calls))
+
+    async def _call(self, function: Callable[..., T], *arguments: Any) -> T:
+        call = self._thread.submit(function, *arguments)
+        self._calls.add(call)
+        call.add_done_callback(self._calls.discard)
+        return await asyncio.wrap_future(call)
+
+    def _opened_backend(self) -> Backend:
         if self._backend is None:
-            self._backend = self._make_backend()
+            raise RuntimeError("RenderThread must be started before it is used; await start()")
         return self._backend
 
-    def _render(self, scene: str, camera: "Camera") -> "Frame":
-        return self._renderer(resolve_scene(self._get_backend().scenes(), scene)).render(camera)
+    def _render(self, key: FrameKey, asked_s: float) -> Rendered:
+        started_s = time.perf_counter()
+        num_opened = self.scenes.num_opened
+        renderer = self.scenes.get(key.scene)
+        seconds = {"queue": started_s - asked_s}
+        if self.scenes.num_opened > num_opened:
+            seconds["open"] = time.perf_counter() - started_s
+        frame = renderer.render(key.camera) if key.point is None else renderer.render(key.camera, key.point)
+        return Rendered(frame, seconds | frame.seconds)
 
-    def _renderer(self, digest: str) -> Renderer:
-        if digest not in self._open:
-            while len(self._open) >= self._max_open_scenes:
-                self._open.popitem(last=False)
-            self._open[digest] = self._get_backend().open(digest)
-        self._open.move_to_end(digest)
-        return self._open[digest]
+
+def scene_key(entry: Entry) -> SceneKey:
+    """What identifies a catalogue entry's scene among the open ones."""
+    return SceneKey(entry["digest"], entry["network"])

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -13,13 +14,17 @@ from workers.bake import load_caches
 from workers.camera import Camera
 from workers.element_stage import run_elements
 from workers.errors import WorkerError
+from workers.footprint import scene_nbytes
 from workers.progress import Progress
+from workers.published import renderable_scenes
 from workers.query import CHANNELS, QueryProgram
 from workers.reconstruct import Reconstructor
 from workers.run_state import RunState
 from workers.scene import load_scene
 from workers.settings import Settings
 from workers.train import load_network
+
+__all__ = ["Frame", "FrameRenderer", "open_run", "publish", "renderable_scenes"]
 
 
 @dataclass(frozen=True)
@@ -77,6 +82,11 @@ class FrameRenderer:
             renderer.render(run.scene.camera.resized(run.settings.width, run.settings.height))
         return renderer
 
+    @cached_property
+    def nbytes(self) -> int:
+        """Memory that the open scene holds, bytes (`workers/footprint.py`)."""
+        return scene_nbytes(self.program, self.reconstructor)
+
     def render(self, camera: Camera) -> Frame:
         """Reconstructs the frame of a camera; any pose is answered."""
         return make_frame(self.program, self.reconstructor, self.reconstructor.encoding.exposure, camera)
@@ -133,9 +143,3 @@ def open_run(store: Store, entry: dict[str, Any], progress: Progress) -> tuple[R
             f"run: lightwell run {entry['source']} --store {store.url}"
         )
     return RunState(scene, store, settings, progress), UnitRef(scene.digest, "train", entry["network"])
-
-
-def renderable_scenes(store: Store) -> list[dict[str, Any]]:
-    """Scenes of a store that can be served."""
-    names = ("name", "digest", "width", "height", "preset", "psnr")
-    return [{name: entry.get(name) for name in names} for entry in store.scenes() if "network" in entry]

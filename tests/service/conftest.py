@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -71,7 +72,7 @@ def make_evaluation(scene: str = "tabletop", width: int = 24, height: int = 16) 
 
 @dataclass
 class FakeBackend:
-    """Two scenes that share a name and one of its own; notes which thread did what."""
+    """Two scenes that share a name and one of its own; notes which thread opened and rendered."""
 
     seconds_a_frame: float = 0.0
     opened: list[str] = field(default_factory=list)
@@ -80,21 +81,22 @@ class FakeBackend:
     busy: int = 0
     most_busy: int = 0
     failure: BaseException | None = None
+    non_finite: int = 0
+    nbytes: int = 1000
+    num_trims: int = 0
+    gate: threading.Event | None = None  # a frame waits for it
+    begun: threading.Event = field(default_factory=threading.Event)  # set by a frame that does
 
     def scenes(self) -> list[dict[str, Any]]:
+        facts = {"network": "n1", "width": 64, "height": 64, "preset": "draft", "psnr": None}
+        names = {"d1": "tabletop", "d2": "hall", "d3": "hall"}
+        return [{"name": name, "digest": digest, **facts} for digest, name in names.items()]
+
+    def warm_up(self) -> None:
         self.threads.add(threading.get_ident())
-        return [
-            {
-                "name": "tabletop",
-                "digest": "d1",
-                "width": 256,
-                "height": 256,
-                "preset": "draft",
-                "psnr": 34.25,
-            },
-            {"name": "hall", "digest": "d2", "width": 64, "height": 64, "preset": "draft", "psnr": None},
-            {"name": "hall", "digest": "d3", "width": 64, "height": 64, "preset": "draft", "psnr": None},
-        ]
+
+    def trim(self) -> None:
+        self.num_trims += 1
 
     def open(self, digest: str) -> "FakeBackend":
         self.threads.add(threading.get_ident())
@@ -107,11 +109,14 @@ class FakeBackend:
             raise self.failure
         self.busy += 1
         self.most_busy = max(self.busy, self.most_busy)
+        self.begun.set()
+        if self.gate is not None:
+            assert self.gate.wait(10)
         time.sleep(self.seconds_a_frame)
         self.cameras.append(camera)
         radiance = np.full((camera.height, camera.width, 3), 0.25, np.float32)
         self.busy -= 1
-        return FakeFrame(radiance, {"query": 0.004, "network": 0.0015})
+        return FakeFrame(radiance, {"query": 0.004, "network": 0.0015}, non_finite=self.non_finite)
 
 
 @pytest.fixture
@@ -122,3 +127,16 @@ def evaluation() -> FakeEvaluation:
 @pytest.fixture
 def backend() -> FakeBackend:
     return FakeBackend()
+
+
+@pytest.fixture
+def until() -> Callable[[Callable[[], bool]], None]:
+    """Waits until something is true; fails after ten seconds."""
+
+    def wait(true: Callable[[], bool]) -> None:
+        deadline_s = time.monotonic() + 10
+        while not true():
+            assert time.monotonic() < deadline_s, "it did not come true within 10 s"
+            time.sleep(0.005)
+
+    return wait

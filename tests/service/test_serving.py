@@ -1,5 +1,6 @@
 """The server's socket, and a real server on it."""
 
+import signal
 import socket
 import threading
 import time
@@ -7,11 +8,10 @@ import urllib.request
 from typing import Any
 
 import pytest
-import uvicorn
 
 from service.app import create_app
 from service.errors import OptionError
-from service.serving import bind, is_loopback
+from service.serving import bind, is_loopback, make_server
 
 
 @pytest.mark.parametrize(
@@ -34,11 +34,24 @@ def test_a_port_in_use_is_an_option_error() -> None:
         bind("127.0.0.1", taken.getsockname()[1])
 
 
+def test_answers_wait_for_no_acknowledgement() -> None:
+    with bind("127.0.0.1", 0) as listener, socket.create_connection(listener.getsockname()):
+        accepted, _ = listener.accept()
+        with accepted:
+            assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) != 0
+
+
+def test_a_server_told_to_stop_is_not_ready(backend: Any) -> None:
+    app = create_app("unused", make_backend=lambda: backend)
+    make_server(app).handle_exit(signal.SIGTERM, None)
+    assert app.state.readiness.phase == "stopping"
+
+
 def test_a_bound_socket_is_served(backend: Any) -> None:
     app = create_app("unused", make_backend=lambda: backend)
     with bind("127.0.0.1", 0) as listener:
         assert listener.family == socket.AF_INET
-        server = uvicorn.Server(uvicorn.Config(app, log_level="error"))
+        server = make_server(app, log_level="error")
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         deadline_s = time.monotonic() + 10

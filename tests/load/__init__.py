@@ -1,0 +1,1 @@
+"""Load tests: run by hand, never collected (`python -m tests.load.frames --help`)."""
