@@ -76,6 +76,8 @@ def _draw(axes: Any, rows: Sequence[Row], cost: str, error: str) -> None:
         axes.scatter(*points, color=colour, marker=marker, s=26, label=kind, zorder=2)
         for row in shown:
             if kind in LABELLED or row in front:
-                axes.annotate(tradeoff_title(row).removeprefix("ours, "), (row[cost], row[error]), fontsize=6,
+                label = axes.annotate(tradeoff_title(row).removeprefix("ours, "), (row[cost], row[error]), fontsize=6,
                               xytext=(3, 3), textcoords="offset points", color=colour)  # fmt: skip
+                label.set_in_layout(False)  # else panels shrink until every label fits beside them
+    axes.margins(x=0.2)
     axes.grid(True, which="major", linewidth=0.3)

@@ -113,20 +113,26 @@ Times = dict[str, dict[tuple[int, int], float]]
 def _times(
     base: RunState, prepared: list[PreparedVariant], methods: dict[str, Method], budget: TradeoffBudget
 ) -> Times:
-    """Median milliseconds by row and size: all rows at the run's own size, ours at the others too."""
+    """Median milliseconds by row and size: all rows at the run's own size, ours at the others too.
+
+    All of them in the same rounds: a slow minute must not bend the line through a point's sizes.
+    """
     own = (base.settings.width, base.settings.height)
-    times: Times = {name: {} for name in methods}
+    calls: dict[str, Callable[[int], object]] = {}
+    places: dict[str, tuple[str, tuple[int, int]]] = {}
     for size in dict.fromkeys((own, *budget.sizes)):
         timed = methods if size == own else {one.variant.name: one.render for one in prepared}
         cameras = [camera.resized(*size) for camera in base.paths.test]
-
-        def bound(method: Method, cameras: list[Camera] = cameras) -> Callable[[int], object]:
-            return lambda index: method(cameras[index % len(cameras)], index)
-
-        calls = {name: bound(method) for name, method in timed.items()}
-        description = f"time {size[0]}x{size[1]}"
-        for name, seconds in interleaved_medians(calls, budget.repeats, base.progress, description).items():
-            times[name][size] = 1e3 * seconds
+        for name, method in timed.items():
+            call = f"{name} at {size[0]}x{size[1]}"
+            places[call] = (name, size)
+            calls[call] = lambda index, method=method, cameras=cameras: (  # type: ignore[misc]
+                method(cameras[index % len(cameras)], index)
+            )
+    times: Times = {name: {} for name in methods}
+    for call, seconds in interleaved_medians(calls, budget.repeats, base.progress, "time frames").items():
+        name, size = places[call]
+        times[name][size] = 1e3 * seconds
     return times
 
 
