@@ -28,6 +28,7 @@ from service.request_limits import add_body_limit
 from service.routes_bundles import FORM_OVERHEAD_NBYTES, UPLOAD_PATH, add_bundle_routes
 from service.routes_frames import add_frame_routes
 from service.routes_health import Readiness, add_health_routes
+from service.routes_tradeoff import add_tradeoff_routes, store_tables
 from service.scene_cache import DEFAULT_MEMORY_NBYTES
 from service.schemas import DEFAULT_MAX_PIXELS
 from service.serving import is_loopback
@@ -116,6 +117,7 @@ def create_app(
         job_metrics(metrics.registry, lambda: {state.value: n for state, n in jobs.table.counts().items()})
     if config is not None:
         _add_configured(app, config, jobs)
+    add_tradeoff_routes(app, rendering.catalogue.resolve, store_tables(store_url))
     return app
 
 

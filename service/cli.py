@@ -1,5 +1,6 @@
 """The `lightwell` command. Mitsuba and torch are imported inside the commands: --help answers at once."""
 
+import dataclasses
 import os
 import tempfile
 from pathlib import Path
@@ -190,6 +191,53 @@ def ablate(
 
 
 @app.command()
+def tradeoff(
+    scene: SceneArgument,
+    store: StoreOption,
+    preset: PresetOption = "draft",
+    resolution: ResolutionOption = None,
+    assignments: SetOption = None,
+    json_file: JsonOption = None,
+    plot_file: Annotated[Path | None, typer.Option("--plot", help="also draw it: a .png, .svg or .pdf file")] = None,
+    network_seconds: Annotated[
+        float, typer.Option("--network-seconds", help="training of each network, at most, seconds")
+    ] = 60.0,
+    sizes: Annotated[
+        list[str] | None, typer.Option("--size", help="WIDTHxHEIGHT that is timed too; may be given again")
+    ] = None,
+    repeats: Annotated[int, typer.Option("--repeats", min=1, help="timed rounds; medians count")] = 3,
+    paper: Annotated[bool, typer.Option("--paper/--no-paper", help="with the paper-exact configuration")] = True,
+) -> None:
+    """Measure error against time, bake and bytes over caches, query, network, precision and output scale.
+
+    Keeps the operating points that `lightwell frame` and the service choose from. Trains about ten networks.
+    """
+    with reported():
+        outputs = Outputs(json=json_file)
+        from service.tradeoff import tradeoff_table, write_tradeoff
+        from service.tradeoff_plot import plot_suffix
+
+        if plot_file is not None:
+            plot_suffix(plot_file)
+            check_writable(plot_file, "--plot")
+        from service.progress import RichProgress
+        from service.table import show
+        from storage.store import Store
+        from workers.tradeoff import run_tradeoff
+        from workers.tradeoff_variants import TradeoffBudget
+
+        budget = TradeoffBudget(network_seconds=network_seconds, repeats=repeats, paper=paper)
+        if sizes:
+            budget = dataclasses.replace(budget, sizes=tuple(map(parse_size, sizes)))
+        loaded = _load(scene, resolution)
+        settings = _settings(preset, loaded, assignments)
+        with RichProgress() as progress:
+            table = run_tradeoff(loaded, Store.open(store, create=True), settings, progress, budget)
+        show(tradeoff_table(table.result))
+        write_tradeoff(table.to_json(), outputs.json, plot_file)
+
+
+@app.command()
 def benchmark(
     store: StoreOption,
     output: Annotated[Path, typer.Option("--output", "-o", help="the Markdown page")] = BENCHMARKS_PAGE,
@@ -235,6 +283,11 @@ def frame(
     output: Annotated[Path, typer.Option("--output", "-o", help="a .png, .jpg or .exr file")],
     fov: Annotated[float, typer.Option("--fov", help="field of view across the width, degrees")] = 45.0,
     size: Annotated[str, typer.Option("--size", help="WIDTHxHEIGHT in pixels")] = "640x360",
+    quality: Annotated[
+        str | None, typer.Option("--quality", help="draft, balanced or best of the points that tradeoff measured")
+    ] = None,
+    max_ms: Annotated[float | None, typer.Option("--max-ms", help="of the measured points, within so long")] = None,
+    min_psnr: Annotated[float | None, typer.Option("--min-psnr", help="of the measured points, at least, dB")] = None,
 ) -> None:
     """One frame of a scene that a run has prepared, named by its file or by its name in the store."""
     with reported():
@@ -250,14 +303,18 @@ def frame(
         from storage.store import Store
 
         opened = Store.open(store)
-        from workers.renderer import FrameRenderer
+        from service.frame_choice import Demand, render_chosen
 
         name = _load(scene, None).digest if Path(scene).is_file() else scene
-        rendered = FrameRenderer.open(opened, name).render(camera)
+        demand = Demand(quality=quality, max_ms=max_ms, min_psnr=min_psnr)
+        rendered, choice = render_chosen(opened, name, camera, demand)
         write_file(output, encode(rendered.radiance, rendered.exposure, media_type))
         times = ", ".join(f"{step} {1e3 * seconds:.1f} ms" for step, seconds in rendered.seconds.items())
         print(f"{output}: {width}x{height}, {times}, coverage {100 * rendered.coverage:.1f} %, "
               f"non-finite pixels {rendered.non_finite}")  # fmt: skip
+        if choice is not None:
+            print(f"operating point {choice.point.name!r}: {choice.point.psnr:.2f} dB measured, "
+                  f"{choice.ms:.1f} ms predicted")  # fmt: skip
 
 
 @app.command()

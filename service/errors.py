@@ -53,7 +53,7 @@ class LeaseLostError(ServiceError, RuntimeError):
     """Another process runs the job now; what this one has to say about it no longer counts."""
 
 
-class UnreachableError(ServiceError, OSError):
+class UnreachableTargetError(ServiceError, OSError):
     """No service answers at an address."""
 
 

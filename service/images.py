@@ -6,6 +6,7 @@ Radiance is [height, width, 3] float32, linear, Rec.709 primaries, row 0 on top.
 
 import io
 import zlib
+from collections.abc import Sequence
 from pathlib import PurePath
 
 import numpy as np
@@ -105,17 +106,17 @@ def _quality(accepted: str) -> tuple[str, float]:
     return media_range.lower(), quality if 0.0 <= quality <= 1.0 else 0.0
 
 
-def negotiate(accept: str | None) -> str:
-    """Which of `MEDIA_TYPES` answers an Accept header (RFC 9110, section 12.5.1).
+def negotiate(accept: str | None, media_types: Sequence[str] = MEDIA_TYPES) -> str:
+    """Which of `media_types` answers an Accept header (RFC 9110, section 12.5.1).
 
     The most specific range that names a type gives its quality; equal qualities fall to the order of
-    `MEDIA_TYPES`. No header, or an empty one, accepts everything.
+    `media_types`. No header, or an empty one, accepts everything.
 
     Raises:
         NotAcceptableError: every type has quality 0.
     """
     if accept is None or not accept.strip():
-        return MEDIA_TYPES[0]
+        return media_types[0]
     qualities = dict(_quality(element) for element in accept.split(",") if element.strip())
 
     def quality_of(media_type: str) -> float:
@@ -124,7 +125,7 @@ def negotiate(accept: str | None) -> str:
                 return qualities[media_range]
         return 0.0
 
-    best = max(MEDIA_TYPES, key=quality_of)
+    best = max(media_types, key=quality_of)
     if quality_of(best) <= 0.0:
-        raise NotAcceptableError(f"Accept must allow one of {', '.join(MEDIA_TYPES)}, got {accept!r}")
+        raise NotAcceptableError(f"Accept must allow one of {', '.join(media_types)}, got {accept!r}")
     return best

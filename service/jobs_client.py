@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 import httpx
 
-from service.errors import OptionError, RequestRefusedError, UnreachableError
+from service.errors import OptionError, RequestRefusedError, UnreachableTargetError
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 TIMEOUT_S = 30.0
@@ -78,13 +78,13 @@ class JobsClient:
         """A request's answer.
 
         Raises:
-            UnreachableError: nothing answers there.
+            UnreachableTargetError: nothing answers there.
             RequestRefusedError: the service says no, with its reason.
         """
         try:
             response = self._http.request(method, path, **options)
         except httpx.TransportError as error:
-            raise UnreachableError(
+            raise UnreachableTargetError(
                 f"service must answer at {self._http.base_url}, got {error or type(error).__name__}; start it with "
                 "'lightwell serve --store DIR', or give --url or LIGHTWELL_URL"
             ) from error
@@ -98,7 +98,7 @@ class JobsClient:
         """Every event of a job until it has ended; goes on by itself where the connection breaks.
 
         Raises:
-            UnreachableError: the service stays away.
+            UnreachableTargetError: the service stays away.
             RequestRefusedError: there is no such job, or it may not be seen.
         """
         failures = 0
@@ -119,7 +119,7 @@ class JobsClient:
             except httpx.TransportError as error:
                 failures += 1
                 if failures > MAX_FAILURES:
-                    raise UnreachableError(
+                    raise UnreachableTargetError(
                         f"service must answer at {self._http.base_url}, got {error or type(error).__name__}; "
                         f"'lightwell jobs watch {job_id}' goes on when it does"
                     ) from error

@@ -14,12 +14,13 @@ import math
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from cachetools import LRUCache
 
 from service import images
 from service.errors import BusyError, NonFiniteFrameError, StoppingError
+from service.frame_choice import Demand
 from service.metrics import FrameMetrics
 from service.rendering import FrameKey, Rendered, RenderThread, scene_key
 from service.single_flight import SingleFlight
@@ -36,6 +37,7 @@ FIRST_GUESS_S = 0.5
 RECENT_WEIGHT = 0.1
 """Of the newest frame, in the running mean of seconds."""
 MAX_RETRY_AFTER_S = 120
+NO_DEMAND = Demand()
 ENTRY_NBYTES = 2048
 """Of a remembered picture beside its content: key, camera, numbers."""
 
@@ -73,8 +75,9 @@ class PictureKey:
     @property
     def etag(self) -> str:
         """The same in every process of this version."""
-        scene, camera = self.frame.scene, self.frame.camera
-        parts = [package_version(), scene.digest, scene.network, camera.to_json(), self.media_type]
+        scene, camera, point = self.frame.scene, self.frame.camera, self.frame.point
+        parts: list[Any] = [package_version(), scene.digest, scene.network, camera.to_json(), self.media_type]
+        parts += [] if point is None else [point.overrides, point.network, point.precision, point.scale]
         return f'W/"{hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:32]}"'
 
 
@@ -117,14 +120,16 @@ class Pictures:
         self.metrics.watch_total("lightwell_scenes_opened", "Scenes opened", lambda: scenes.num_opened)
         self.metrics.watch_total("lightwell_scenes_closed", "Scenes closed to make room", lambda: scenes.num_closed)
 
-    async def key(self, scene: str, camera: "Camera", media_type: str) -> PictureKey:
+    async def key(self, scene: str, camera: "Camera", media_type: str, demand: Demand = NO_DEMAND) -> PictureKey:
         """What was asked for.
 
         Raises:
             UnknownSceneError, AmbiguousSceneError: no scene, or several.
+            NoOperatingPointsError, UnreachableTargetError: no measured point meets the demand.
         """
         entry = await self.rendering.catalogue.resolve(scene)
-        return PictureKey(FrameKey(scene_key(entry), camera), media_type)
+        point = await self.rendering.choose(entry["digest"], demand, camera)
+        return PictureKey(FrameKey(scene_key(entry), camera, point), media_type)
 
     async def get(self, key: PictureKey) -> Picture:
         """The picture: remembered, shared or made.

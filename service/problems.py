@@ -13,8 +13,8 @@ from starlette.exceptions import HTTPException
 from models.errors import ModelError
 from service import errors
 from service.redaction import redact
-from storage.errors import StorageError
-from workers.errors import CameraError, SceneError, WorkerError
+from storage.errors import StorageError, StoreUnreachableError
+from workers.errors import CameraError, NoOperatingPointsError, SceneError, UnreachableTargetError, WorkerError
 from workers.job_spec import JobSpecError
 from workers.settings import SettingsError
 
@@ -26,6 +26,7 @@ log = logging.getLogger("lightwell.service")
 STATUS_OF_ERROR: dict[type[Exception], int] = {
     errors.UnknownSceneError: 404,
     errors.UnknownJobError: 404,
+    NoOperatingPointsError: 404,
     errors.NotAcceptableError: 406,
     errors.AmbiguousSceneError: 409,
     errors.JobStateError: 409,
@@ -37,8 +38,10 @@ STATUS_OF_ERROR: dict[type[Exception], int] = {
     JobSpecError: 422,
     SceneError: 422,
     SettingsError: 422,
+    UnreachableTargetError: 422,
     errors.JobDatabaseError: 503,
     SQLAlchemyError: 503,
+    StoreUnreachableError: 503,
     errors.ClientGoneError: CLIENT_GONE,
     errors.NonFiniteFrameError: 500,
     errors.BusyError: 503,
@@ -96,7 +99,8 @@ def _known_error(_: Request, error: Exception) -> JSONResponse:
     is_busy = isinstance(error, errors.BusyError)
     if status >= 500 and not is_busy:
         log.error("%s: %s", type(error).__name__, detail)
-    extra = {"non_finite": error.non_finite} if isinstance(error, errors.NonFiniteFrameError) else {}
+    extra: dict[str, Any] = {"non_finite": error.non_finite} if isinstance(error, errors.NonFiniteFrameError) else {}
+    extra |= {"reachable": error.reachable} if isinstance(error, UnreachableTargetError) else {}
     extra |= getattr(error, "members", {})
     response = problem(status, detail, **extra)
     if status == HTTPStatus.SERVICE_UNAVAILABLE:

@@ -13,10 +13,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from service.catalogue import Catalogue, Entry
+from service.frame_choice import Demand, choose_point
 from service.scene_cache import DEFAULT_MEMORY_NBYTES, OpenScenes, Renderer, SceneKey
 
 if TYPE_CHECKING:
     from workers.camera import Camera
+    from workers.operating_points import OperatingPoint
     from workers.renderer import Frame
 
 T = TypeVar("T")
@@ -36,6 +38,10 @@ class Backend(Protocol):
 
     def open(self, digest: str) -> Renderer:
         """Loads one scene, its caches and its network; takes seconds."""
+        ...
+
+    def choose(self, digest: str, demand: Demand, width: int, height: int) -> "OperatingPoint":
+        """The measured point of a scene that meets a demand. Called on any thread."""
         ...
 
     def trim(self) -> None:
@@ -64,12 +70,17 @@ class StoreBackend:
         return renderable_scenes(self._store)
 
     def warm_up(self) -> None:
-        import workers.renderer  # noqa: F401  # starts Mitsuba and torch
+        import workers.point_renderer  # noqa: F401  # starts Mitsuba and torch
 
     def open(self, digest: str) -> Renderer:
-        from workers.renderer import FrameRenderer
+        from workers.point_renderer import PointRenderer
 
-        return FrameRenderer.open(self._store, digest)
+        return PointRenderer.open(self._store, digest)
+
+    def choose(self, digest: str, demand: Demand, width: int, height: int) -> "OperatingPoint":
+        choice = choose_point(self._store, digest, demand, width, height)
+        assert choice is not None  # something is demanded
+        return choice.point
 
     def trim(self) -> None:
         from workers.footprint import release_freed
@@ -79,10 +90,12 @@ class StoreBackend:
 
 @dataclass(frozen=True)
 class FrameKey:
-    """Everything that decides a frame: the scene's content, the network that serves it, pose, lens and size."""
+    """Everything that decides a frame: the scene's content, the network that serves it, pose, lens and size; and the
+    measured operating point, None for the published run."""
 
     scene: SceneKey
     camera: "Camera"
+    point: "OperatingPoint | None" = None
 
 
 @dataclass(frozen=True)
@@ -132,6 +145,17 @@ class RenderThread:
         for name in self._preload:
             await self._call(self.scenes.get, scene_key(await self.catalogue.resolve(name)))
 
+    async def choose(self, digest: str, demand: Demand, camera: "Camera") -> "OperatingPoint | None":
+        """The operating point that meets a demand, None where nothing is demanded; beside the thread, not on it.
+
+        Raises:
+            NoOperatingPointsError: the scene's trade was never measured.
+            UnreachableTargetError: no point meets the demand.
+        """
+        if not demand:
+            return None
+        return await asyncio.to_thread(self._opened_backend().choose, digest, demand, camera.width, camera.height)
+
     async def render(self, key: FrameKey) -> Rendered:
         """The frame of a key. Cancelled before the thread came to it, it is never begun."""
         return await self._call(self._render, key, time.perf_counter())
@@ -163,7 +187,7 @@ class RenderThread:
         seconds = {"queue": started_s - asked_s}
         if self.scenes.num_opened > num_opened:
             seconds["open"] = time.perf_counter() - started_s
-        frame = renderer.render(key.camera)
+        frame = renderer.render(key.camera) if key.point is None else renderer.render(key.camera, key.point)
         return Rendered(frame, seconds | frame.seconds)
 
 

@@ -15,6 +15,7 @@ from fastapi import FastAPI, Header, Request, Response
 
 from service import images
 from service.errors import ClientGoneError
+from service.frame_choice import point_headers
 from service.pictures import Picture, Pictures
 from service.problems import PROBLEM
 from service.schemas import FrameRequest
@@ -23,11 +24,11 @@ T = TypeVar("T")
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 _PROBLEM_OF_STATUS = {
     400: "the body is no text",
-    404: "no such scene",
+    404: "no such scene, or its trade was never measured",
     406: "Accept allows none of the formats",
     409: "several scenes have this name",
     413: "too many pixels",
-    422: "the request or its camera is not valid",
+    422: "the request or its camera is not valid, or no operating point meets it (`reachable` names the nearest)",
     500: "the frame is not finite (`non_finite` counts its values), or its scene is damaged",
     503: "too many frames are under way; Retry-After says when to ask again",
     507: "the scene needs more memory than all open scenes may take",
@@ -119,7 +120,7 @@ def add_frame_routes(app: FastAPI, pictures: Pictures, *, max_pixels: int) -> No
     ) -> Response:
         start_s = time.perf_counter()
         media_type = images.negotiate(accept)
-        key = await pictures.key(scene, body.to_camera(max_pixels), media_type)
+        key = await pictures.key(scene, body.to_camera(max_pixels), media_type, body.demand)
         try:
             picture = await while_connected(request, pictures.get(key))
         except ClientGoneError:
@@ -127,4 +128,6 @@ def add_frame_routes(app: FastAPI, pictures: Pictures, *, max_pixels: int) -> No
             raise
         metrics.answered.labels(picture.source).inc()
         metrics.request_seconds.observe(time.perf_counter() - start_s)
-        return frame_response(picture)
+        response = frame_response(picture)
+        response.headers.update(point_headers(key.frame.point, body.width, body.height))
+        return response

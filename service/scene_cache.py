@@ -13,6 +13,7 @@ from service.scores import human_bytes
 
 if TYPE_CHECKING:
     from workers.camera import Camera
+    from workers.operating_points import OperatingPoint
     from workers.renderer import Frame
 
 DEFAULT_MEMORY_NBYTES = 4 * 2**30
@@ -30,7 +31,7 @@ class Renderer(Protocol):
         """Memory that the open scene holds: caches, geometry, textures, network."""
         ...
 
-    def render(self, camera: "Camera") -> "Frame": ...
+    def render(self, camera: "Camera", point: "OperatingPoint | None" = None) -> "Frame": ...
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,11 @@
 """What a frame request may hold: pydantic models with their limits, and their conversion to a `Camera`."""
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from service.errors import FrameTooLargeError
+from service.frame_choice import Demand
 
 if TYPE_CHECKING:
     from workers.camera import Camera
@@ -70,6 +71,18 @@ class FrameRequest(_Strict):
     fov_deg: FiniteFloat = Field(default=45.0, gt=0, lt=180, description="field of view across the width, degrees")
     width: int = Field(default=640, ge=1, le=MAX_SIDE_PX, strict=True, description="pixels")
     height: int = Field(default=360, ge=1, le=MAX_SIDE_PX, strict=True, description="pixels")
+    quality: Literal["draft", "balanced", "best"] | None = Field(
+        default=None, description="of the operating points that `lightwell tradeoff` measured"
+    )
+    max_ms: FiniteFloat | None = Field(
+        default=None, gt=0, description="a measured point that takes at most so long from pose to frame, milliseconds"
+    )
+    min_psnr: FiniteFloat | None = Field(default=None, description="a measured point of at least so many dB")
+
+    @property
+    def demand(self) -> Demand:
+        """What must hold besides pose and size."""
+        return Demand(quality=self.quality, max_ms=self.max_ms, min_psnr=self.min_psnr)
 
     def to_camera(self, max_pixels: int = DEFAULT_MAX_PIXELS) -> "Camera":
         """The camera that this request describes.

@@ -4,6 +4,7 @@ everywhere.
 store.json                                      layout version; a folder without it is no store
 quarantine/<digest>/<stage>/<key>/unit.json     why a unit was set aside; a bake unit: 000042.json
 scenes/<digest>/scene.json                      name and facts of a scene
+scenes/<digest>/tradeoff.json                   its measured operating points, replaced as a whole
 scenes/<digest>/<stage>/<key>/<files>           one unit
 scenes/<digest>/<stage>/<key>/commit.json       its marker, written last
 scenes/<digest>/bake/<key>/caches.zarr/         a cache set: zarr v3 arrays, one chunk per bake unit
@@ -28,6 +29,7 @@ READABLE_LAYOUTS = (1, 2)
 STORE_FILE = "store.json"
 SCENES = "scenes"
 SCENE_FILE = "scene.json"
+TRADEOFF_FILE = "tradeoff.json"
 MARKER = "commit.json"
 CACHES = "caches.zarr"
 UNIT_MARKERS = "units"
@@ -64,6 +66,10 @@ def scene_folder(digest: str) -> str:
 
 def scene_file(digest: str) -> str:
     return f"{scene_folder(digest)}/{SCENE_FILE}"
+
+
+def tradeoff_file(digest: str) -> str:
+    return f"{scene_folder(digest)}/{TRADEOFF_FILE}"
 
 
 def stage_folder(digest: str, stage: str) -> str:

@@ -88,7 +88,7 @@ def _row(run: RunState, variant: Variant) -> dict[str, Any]:
     test_refs = run_render(run, paths.test, frames.test_spp, "render test references")
     features = [program.run(camera) for camera in paths.test]
     irs = [np.ascontiguousarray(f[..., slice(*CHANNELS["ir"])]) for f in features]
-    exposure, finals = _exposure(run, train_refs), irs
+    exposure, finals = training_exposure(run, train_refs), irs
     if variant.network:
         validation_refs = run_render(run, paths.validation, frames.train_spp, "render validation frames")
         inputs = [run_inputs(run, elements, program, cameras) for cameras in (paths.train, paths.validation)]
@@ -101,15 +101,15 @@ def _row(run: RunState, variant: Variant) -> dict[str, Any]:
                          for images in (irs, finals))  # fmt: skip
     row = {"name": variant.name, "network": variant.network, "ir_psnr": mean_score(ir_scores, "psnr")}
     row |= {metric: mean_score(scores, metric) for metric in ("psnr", "ssim", "flip")}
-    return row | _bake_cost(run, elements)
+    return row | bake_cost(run, elements)
 
 
-def _exposure(run: RunState, refs: list[UnitRef]) -> float:
+def training_exposure(run: RunState, refs: list[UnitRef]) -> float:
     layer = "denoised" if run.settings.frames.denoise_train else "radiance"
     return exposure_from_luminance([luminance(load_render(run, ref)[layer]) for ref in refs])
 
 
-def _bake_cost(run: RunState, elements: ElementSet) -> dict[str, float]:
+def bake_cost(run: RunState, elements: ElementSet) -> dict[str, float]:
     cache = run.settings.cache
     diffuse = elements.num_elements * cache.diffuse_spp if cache.lobes == "split" else 0
     directional = len(elements.glossy) * cache.azimuth * cache.polar * cache.directional_spp

@@ -1,5 +1,7 @@
 """Errors that workers raise: one root, and one class per noun that a caller may want to tell apart."""
 
+from typing import Any
+
 
 class WorkerError(Exception):
     """Root of everything that this package raises on purpose."""
@@ -39,3 +41,23 @@ class StoppedError(WorkerError):
 
 class ChangedSceneError(WorkerError):
     """A unit was planned for a scene whose files have changed since."""
+
+
+class OperatingPointError(WorkerError, ValueError):
+    """A demand is no demand, or a scene's table cannot be read."""
+
+
+class NoOperatingPointsError(OperatingPointError):
+    """The scene's trade was never measured, or no longer fits the scene's run."""
+
+
+class UnreachableTargetError(OperatingPointError):
+    """No measured point meets the demand.
+
+    Attributes:
+        reachable: what comes nearest: "fastest" and "best", each {"point", "ms", "psnr"}.
+    """
+
+    def __init__(self, message: str, reachable: dict[str, dict[str, Any]]) -> None:
+        super().__init__(message)
+        self.reachable = reachable

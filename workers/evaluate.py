@@ -70,8 +70,8 @@ def run_evaluation(
     """Scores and times every method on the test path."""
     exposure = renderer.reconstructor.encoding.exposure
     reference = load_reference(run, test_refs, exposure)
-    perceptual = _perceptual()
-    methods = _methods(run, renderer)
+    perceptual = find_perceptual()
+    methods = compared_methods(run, renderer)
     cameras = run.paths.test
     with run.progress.track("evaluate", len(methods) * len(cameras)) as advance:
         frames: dict[str, list[np.ndarray]] = {}
@@ -81,13 +81,13 @@ def run_evaluation(
                 frames[name].append(method(camera, index))
                 advance(note=name)
     milliseconds = _interleaved_times(run, methods)
-    positions = [_positions(renderer, camera) for camera in cameras]
+    positions = [positions_of(renderer, camera) for camera in cameras]
     near_cameras = [run.scene.frame.near_camera(camera) for camera in cameras]
     rows = []
     with run.progress.track("score", len(methods)) as advance:
         for name in methods:
             shared = (reference.frames, exposure, perceptual, near_cameras, positions)
-            rows.append(_row(name, frames[name], *shared, milliseconds[name]))
+            rows.append(score_row(name, frames[name], *shared, milliseconds[name]))
             advance(note=name)
     coverage = float(np.mean([renderer.render(camera).coverage for camera in cameras]))
     notes = [*run.scene.notes, *run.paths.notes]
@@ -118,7 +118,7 @@ def load_reference(run: RunState, refs: list[UnitRef], exposure: float) -> Refer
     return Reference([x["denoised" if denoised else "radiance"] for x in layers], error_db, denoised)
 
 
-def _perceptual() -> Perceptual | None:
+def find_perceptual() -> Perceptual | None:
     weights = find_stlpips()
     if weights is None:
         return None
@@ -128,7 +128,7 @@ def _perceptual() -> Perceptual | None:
 Method = Callable[[Camera, int], np.ndarray]
 
 
-def _methods(run: RunState, renderer: FrameRenderer) -> dict[str, Method]:
+def compared_methods(run: RunState, renderer: FrameRenderer) -> dict[str, Method]:
     """Every row of the table: a function from camera and frame index to radiance, all of it timed."""
     a, b = CHANNELS["ir"]
 
@@ -187,12 +187,12 @@ def _interleaved_times(run: RunState, methods: dict[str, Method]) -> dict[str, f
     return {name: float(np.median(values)) * 1e3 for name, values in times.items()}
 
 
-def _positions(renderer: FrameRenderer, camera: Camera) -> np.ndarray:
+def positions_of(renderer: FrameRenderer, camera: Camera) -> np.ndarray:
     a, b = CHANNELS["position"]
     return np.ascontiguousarray(renderer.program.run(camera)[..., a:b])
 
 
-def _row(
+def score_row(
     name: str, frames: list[np.ndarray], references: list[np.ndarray], exposure: float,
     perceptual: Perceptual | None, cameras: list[Camera], positions: list[np.ndarray], milliseconds: float,
 ) -> dict[str, Any]:  # fmt: skip

@@ -1,9 +1,10 @@
 """Frames of a prepared scene: what the service asks for."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -49,15 +50,16 @@ class Frame:
 class FrameRenderer:
     """Caches, query program and network of one scene, ready for any camera pose."""
 
-    def __init__(self, program: QueryProgram, reconstructor: Reconstructor) -> None:
+    def __init__(self, program: QueryProgram, reconstructor: Reconstructor, run: RunState | None = None) -> None:
         self.program = program
         self.reconstructor = reconstructor
+        self.run = run  # what it was opened from
 
     @classmethod
     def open(
         cls, store: Store, scene_name: str, *, progress: Progress | None = None, compile: bool = False,
         warm_up: bool = True,
-    ) -> "FrameRenderer":  # fmt: skip
+    ) -> Self:  # fmt: skip
         """Loads what `run_scene` prepared.
 
         Args:
@@ -76,7 +78,7 @@ class FrameRenderer:
         elements = run_elements(run)
         program = QueryProgram(run.scene.mi_scene, run.table, elements, load_caches(run, elements), run.settings.query)
         precision = run.settings.train.precision
-        renderer = cls(program, Reconstructor(network, encoding, precision=precision, compile=compile))
+        renderer = cls(program, Reconstructor(network, encoding, precision=precision, compile=compile), run)
         if warm_up:
             renderer.render(run.scene.camera.resized(run.settings.width, run.settings.height))
         return renderer
@@ -88,25 +90,32 @@ class FrameRenderer:
 
     def render(self, camera: Camera) -> Frame:
         """Reconstructs the frame of a camera; any pose is answered."""
-        start = time.perf_counter()
-        features = self.program.run(camera)
-        queried = time.perf_counter()
-        bad_inputs = _finite_in_place(features[..., : CHANNELS["position"][0]], 0.0)
-        radiance = self.reconstructor(features)
-        bad_outputs = _finite_in_place(radiance, features[..., slice(*CHANNELS["ir"])])
-        finished = time.perf_counter()
-        a, b = CHANNELS["coverage"]
-        return Frame(
-            radiance=radiance,
-            seconds={"query": queried - start, "network": finished - queried},
-            coverage=float(np.mean(features[..., a:b])),
-            exposure=self.reconstructor.encoding.exposure,
-            non_finite=bad_inputs + bad_outputs,
-        )
+        return make_frame(self.program, self.reconstructor, self.reconstructor.encoding.exposure, camera)
 
     def unchecked(self, camera: Camera) -> np.ndarray:
         """Radiance as the network gives it, NaN and Inf included: for scores, which must refuse them."""
         return self.reconstructor(self.program.run(camera))
+
+
+def make_frame(
+    program: QueryProgram, reconstruct: Callable[[np.ndarray], np.ndarray], exposure: float, camera: Camera
+) -> Frame:
+    """Queries a camera and turns the features into its frame."""
+    start = time.perf_counter()
+    features = program.run(camera)
+    queried = time.perf_counter()
+    bad_inputs = _finite_in_place(features[..., : CHANNELS["position"][0]], 0.0)
+    radiance = reconstruct(features)
+    bad_outputs = _finite_in_place(radiance, features[..., slice(*CHANNELS["ir"])])
+    finished = time.perf_counter()
+    a, b = CHANNELS["coverage"]
+    return Frame(
+        radiance=radiance,
+        seconds={"query": queried - start, "network": finished - queried},
+        coverage=float(np.mean(features[..., a:b])),
+        exposure=exposure,
+        non_finite=bad_inputs + bad_outputs,
+    )
 
 
 def _finite_in_place(values: np.ndarray, instead: np.ndarray | float) -> int:

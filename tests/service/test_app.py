@@ -15,7 +15,7 @@ from PIL import Image
 
 from service.app import create_app
 from service.routes_frames import server_timing
-from storage.errors import DamagedUnitError, StorageError
+from storage.errors import DamagedUnitError, StorageError, StoreUnreachableError
 from storage.frames import decode_frame
 
 LOOK_AT = {"origin": [0, 1, 5], "target": [0, 1, 0], "up": [0, 1, 0]}
@@ -142,6 +142,7 @@ def test_unknown_paths_and_methods_are_problems_too(client: TestClient) -> None:
     [
         (DamagedUnitError("unit x must match\nits marker"), 500, "unit x must match its marker"),
         (StorageError("gone"), 500, "gone"),
+        (StoreUnreachableError("store s3://b must answer"), 503, "must answer"),
         (MemoryError(), 503, "not enough memory"),
         (ZeroDivisionError("secret detail"), 500, r"failed on this request \(ZeroDivisionError\)"),
     ],

@@ -23,6 +23,7 @@ from service.jobs.planner import Planner
 from service.jobs.schemas import JobRequest
 from service.jobs.service import Jobs
 from service.jobs.submission import Desk
+from storage.store import Store
 from workers.scene_request import SceneRequest
 
 EXAMPLES = int(os.environ.get("LIGHTWELL_FUZZ_EXAMPLES", "10"))
@@ -80,11 +81,12 @@ def jobs(tmp_path_factory: pytest.TempPathFactory) -> Jobs:
 
 
 @pytest.fixture(scope="module")
-def url(jobs: Jobs, serve_app: Any) -> Iterator[str]:
+def url(jobs: Jobs, serve_app: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """A real server with stand-ins for what renders and what runs jobs."""
+    store = Store.open(tmp_path_factory.mktemp("fuzz") / "store", create=True)
     with (
         pytest.MonkeyPatch.context() as patch,
-        serve_app(create_app("unused", make_backend=Scenes, max_pixels=10_000, jobs=jobs)) as address,
+        serve_app(create_app(store.url, make_backend=Scenes, max_pixels=10_000, jobs=jobs)) as address,
     ):
         patch.setenv("NO_PROXY", "127.0.0.1")
         deadline_s = time.monotonic() + 10

@@ -13,7 +13,7 @@ from typer.testing import CliRunner, Result
 
 from service.app import create_app
 from service.cli import app as cli
-from service.errors import OptionError, RequestRefusedError, UnreachableError
+from service.errors import OptionError, RequestRefusedError, UnreachableTargetError
 from service.jobs.service import Jobs
 from service.jobs.submission import Desk
 from service.jobs_client import JobsClient, StreamEvent, parse_events
@@ -132,7 +132,7 @@ def test_a_broken_stream_goes_on_after_the_last_event() -> None:
 
 
 def test_a_service_that_stays_away_ends_the_watch() -> None:
-    with pytest.raises(UnreachableError, match="lightwell jobs watch abc"):
+    with pytest.raises(UnreachableTargetError, match="lightwell jobs watch abc"):
         list(client_of([]).events("abc", wait=lambda _: None))
 
 
