@@ -2,7 +2,7 @@
 
 import numbers
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -127,4 +127,6 @@ def _text(value: Any) -> str:
     return value
 
 
-_CONVERSIONS = MappingProxyType({bool: _boolean, int: _whole_number, float: _number, str: _text})
+_CONVERSIONS: Mapping[type, Callable[[Any], Any]] = MappingProxyType(
+    {bool: _boolean, int: _whole_number, float: _number, str: _text}
+)
