@@ -12,6 +12,7 @@ from workers.camera import Camera
 from workers.element_stage import elements_ref, run_elements
 from workers.elements import ElementSet
 from workers.errors import OperatingPointError
+from workers.network_record import load_network
 from workers.operating_points import OperatingPoint
 from workers.operating_table import OperatingTable, load_table
 from workers.query import CHANNELS, CacheArrays, QueryProgram
@@ -19,7 +20,6 @@ from workers.reconstruct import Reconstructor
 from workers.renderer import Frame, FrameRenderer, make_frame
 from workers.run_state import RunState
 from workers.settings import Settings
-from workers.train import load_network
 from workers.upsample import HalfScaleReconstructor
 
 Reconstruct = Callable[[np.ndarray], np.ndarray]
