@@ -100,8 +100,8 @@ def frame_times(
         progress: told round by round.
 
     Returns:
-        "width", "height", "repeats", "samples" (of the run's query, along each axis), "supersample"; "ms" by part: "primary"
-        (one ray a pixel, nothing but the intersection), "query-1x1", "query" (the run's own samples),
+        "width", "height", "repeats", "samples" (of the run's query, along each axis), "supersample"; "ms" by part:
+        "primary" (one ray a pixel, nothing but the intersection), "query-1x1", "query" (the run's own samples),
         "network", "frame" (query and network), "pt-1" (one path a pixel), "oidn-<quality>" (Open Image
         Denoise alone, with albedo and normal); "ratios" of them; "network" as `network_rate` returns it.
     """
