@@ -205,7 +205,7 @@ def tradeoff(
     sizes: Annotated[
         list[str] | None, typer.Option("--size", help="WIDTHxHEIGHT that is timed too; may be given again")
     ] = None,
-    repeats: Annotated[int, typer.Option("--repeats", min=1, help="timed rounds; medians count")] = 3,
+    repeats: Annotated[int, typer.Option("--repeats", min=1, help="timed rounds; medians count")] = 5,
     paper: Annotated[bool, typer.Option("--paper/--no-paper", help="with the paper-exact configuration")] = True,
 ) -> None:
     """Measure error against time, bake and bytes over caches, query, network, precision and output scale.

@@ -5,7 +5,7 @@ machine hits all alike, and medians count. A first round, not counted, compiles 
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
@@ -21,7 +21,15 @@ MATMUL_REPEATS = 4
 def interleaved_medians(
     methods: dict[str, Callable[[int], object]], repeats: int, progress: Progress, description: str
 ) -> dict[str, float]:
-    """Median wall seconds of each method.
+    """Median wall seconds of each method; arguments as `interleaved_seconds`."""
+    rounds = interleaved_seconds(methods, repeats, progress, description)
+    return {name: float(np.median(values)) for name, values in rounds.items()}
+
+
+def interleaved_seconds(
+    methods: dict[str, Callable[[int], object]], repeats: int, progress: Progress, description: str
+) -> dict[str, list[float]]:
+    """Wall seconds of each method in every counted round.
 
     Args:
         methods: name to function of the round's index (0 is the round that is not counted); each must return
@@ -40,7 +48,28 @@ def interleaved_medians(
                 if index:
                     times[name].append(seconds)
             advance()
-    return {name: float(np.median(values)) for name, values in times.items()}
+    return times
+
+
+def spread_of(rounds: Iterable[Sequence[float]], share: float = 0.95) -> float:
+    """How far above the median of the other rounds one round lies, at most, in `share` of the cases.
+
+    Rounds of several methods are pooled: few repeats of one tell nothing of its tail.
+
+    Args:
+        rounds: seconds of each method; those with fewer than two rounds are left out.
+        share: quantile, in (0, 1).
+
+    Returns:
+        Relative excess, >= 0; 0 where there is nothing to tell it from.
+    """
+    ratios = [
+        seconds / np.median([*values[:index], *values[index + 1 :]])
+        for values in rounds
+        if len(values) > 1
+        for index, seconds in enumerate(values)
+    ]
+    return max(0.0, float(np.quantile(ratios, share)) - 1.0) if ratios else 0.0
 
 
 @contextmanager
