@@ -190,10 +190,8 @@ def _cost_curves(curves: Sequence[Record]) -> list[str]:
     lines = ["## Cost curves", "", "Costs against the number of triangles, n, of one scene.", ""]
     for record in curves:
         result = record["result"]
-        shown = (
-            f"{result['width']}x{result['height']}, preset {result['preset']}, {result['triangles']:,} triangles in "
-        )
-        shown += f"its file; ours within {result['max_elements']:,} elements."
+        shown = f"{result['width']}x{result['height']}, preset {result['preset']}; {result['triangles']:,} triangles "
+        shown += f"in the file; ours within {result['max_elements']:,} elements."
         lines += [f"### {record['scene']}: costs", "", f"{shown} {sentence(result)}", ""]
         lines += ["```sh", record["command"], "```", "", f"Commit {result['commit']}.", ""]
         for kind in dict.fromkeys(row["kind"] for row in result["rows"]):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from service.batch_cli import batch_app, dataset
+from service.cost_curves_cli import cost_curves
 from service.export_cli import export
 from service.failures import reported
 from service.jobs_cli import jobs_app
@@ -368,6 +369,7 @@ def worker(
 
 app.command()(dataset)
 app.command()(export)
+app.command("cost-curves")(cost_curves)
 
 
 def main() -> None:
