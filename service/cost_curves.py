@@ -111,8 +111,7 @@ def remarks(result: Mapping[str, Any]) -> list[str]:
     load, frame = result["load"], result["frame"]
     return [
         f"{result['machine']}; query of {frame['width']}x{frame['height']}, median of {result['repeats']} interleaved "
-        f"rounds; other processes kept {load['other_cpus']:.1f} of {load['cpus']:.0f} CPUs busy (the processes that "
-        "measure count)",
+        f"rounds; other processes kept {load['other_cpus']:.1f} of {load['cpus']:.0f} CPUs busy",
         *(f"note: {note}" for note in result["notes"]),
     ]
 

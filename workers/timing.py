@@ -6,7 +6,7 @@ machine hits all alike, and medians count. A first round, not counted, compiles 
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import numpy as np
 import psutil
@@ -77,16 +77,25 @@ def other_load() -> Iterator[dict[str, float]]:
     """Measures what else ran meanwhile: times taken on a busy machine are too long.
 
     Yields:
-        A dict that holds "other_cpus" (mean number of CPU threads that other processes kept busy) and "cpus"
-        once the block has ended.
+        A dict that holds "other_cpus" (mean number of CPU threads that others than this process and its children
+        kept busy) and "cpus" once the block has ended.
     """
     load: dict[str, float] = {}
     own = psutil.Process()
-    busy, mine, wall = _busy_seconds(psutil.cpu_times()), sum(own.cpu_times()[:2]), time.perf_counter()
+    busy, mine, wall = _busy_seconds(psutil.cpu_times()), _family_seconds(own), time.perf_counter()
     yield load
     elapsed = max(time.perf_counter() - wall, 1e-9)
-    others = _busy_seconds(psutil.cpu_times()) - busy - (sum(own.cpu_times()[:2]) - mine)
+    others = _busy_seconds(psutil.cpu_times()) - busy - (_family_seconds(own) - mine)
     load |= {"other_cpus": max(others, 0.0) / elapsed, "cpus": float(psutil.cpu_count() or 1)}
+
+
+def _family_seconds(process: psutil.Process) -> float:
+    """CPU seconds of a process, of its children that live, and of those that ended."""
+    seconds = sum(process.cpu_times()[:4])  # user, system, and the same of ended children
+    for child in process.children():
+        with suppress(psutil.NoSuchProcess):
+            seconds += _family_seconds(child)
+    return seconds
 
 
 def _busy_seconds(times: object) -> float:

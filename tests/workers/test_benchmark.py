@@ -211,3 +211,15 @@ def test_bake_throughput_of_exitant_caches_has_no_diffuse_lobe(run: RunState) ->
     cache = exitant.settings.cache
     assert set(result["ratios"]) == {"directional"}
     assert result["paths"]["directional"] % (cache.azimuth * cache.polar * cache.directional_spp) == 0
+
+
+def test_spread_is_what_single_rounds_stray_from_the_others() -> None:
+    rng = np.random.default_rng(1)
+    rounds = [list(base * np.exp(rng.normal(0, 0.1, 200))) for base in (1.0, 50.0)]
+    assert timing.spread_of(rounds) == pytest.approx(np.exp(1.645 * 0.1) - 1, abs=0.03)  # the normal's 95 % quantile
+    assert timing.spread_of([[2.0, 2.0, 2.0]]) == 0.0
+    assert timing.spread_of([[1.0, 3.0]], share=0.999) == pytest.approx(2.0, rel=0.01)
+
+
+def test_spread_of_single_rounds_is_not_known() -> None:
+    assert timing.spread_of([[1.0], [7.0]]) == 0.0
