@@ -46,7 +46,7 @@ def row_cells(row: Mapping[str, Any]) -> list[str]:
     bake = human_seconds(row["bake_seconds"]) + (f" ± {human_seconds(error)}" if error else "")
     return [
         f"{row['triangles']:,}", row["rule"], f"{row['elements']:,}", human_seconds(row["elements_seconds"]),
-        f"{row['bake_paths'] / 1e6:,.4g} M", bake, human_bytes(row["nbytes"]),
+        f"{row['bake_paths'] / 1e6:,.2f} M", bake, human_bytes(row["nbytes"]),
         ABSENT if row["memory_nbytes"] is None else human_bytes(row["memory_nbytes"]),
         ABSENT if row["query_ms"] is None else f"{row['query_ms']:.1f}",
     ]  # fmt: skip

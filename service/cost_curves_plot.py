@@ -9,6 +9,7 @@ import numpy as np
 from service.cost_curves import QUANTITY_TITLES, kind_title
 
 DPI = 110
+MARGIN = 2.0
 _PANELS = ("elements_seconds", "bake_paths", "bake_seconds", "nbytes", "memory_nbytes", "query_ms")
 _STYLES = {"lattice": ("#c2570c", "o"), "triangle": ("#2b6cb0", "D")}
 _OTHER = ("#7d828a", "x")
@@ -52,9 +53,11 @@ def _draw(axes: Any, rows: Sequence[Mapping[str, Any]], fits: Sequence[Mapping[s
             axes.plot(ends, level * ends ** fit["exponent"], color=colour, linewidth=0.8, zorder=1)
         bars = [row["bake_seconds_error"] for row in having] if quantity == "bake_seconds" else None
         axes.errorbar(counts, costs, yerr=bars, color=colour, marker=marker, linestyle="none", label=label, zorder=2)
-    if axes.has_data():
+    shown = [row[quantity] for row in rows if row[quantity]]
+    if shown:
         axes.set_xscale("log")
         axes.set_yscale("log")
+        axes.set_ylim(min(shown) / MARGIN, max(shown) * MARGIN)  # a cost that does not move has no range of its own
         axes.legend(fontsize=8)
     axes.set_xlabel("triangles")
     axes.set_ylabel(QUANTITY_TITLES[quantity])

@@ -153,7 +153,9 @@ def _fit(pairs: Iterable[tuple[int, float | None]]) -> dict[str, Any]:
     if len(logs) < 2 or np.ptp(logs[:, 0]) == 0:
         return {"exponent": None, "standard_error": None, "points": len(logs)}
     fit = linregress(logs[:, 0], logs[:, 1])
-    error = float(fit.stderr) if len(logs) > 2 else None
+    error = None
+    if len(logs) > 2:
+        error = float(fit.stderr) if np.ptp(logs[:, 1]) > 0 else 0.0  # of a constant scipy tells NaN
     return {"exponent": float(fit.slope), "standard_error": error, "points": len(logs)}
 
 
