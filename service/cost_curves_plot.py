@@ -38,6 +38,11 @@ def cost_curves_plot(result: Mapping[str, Any], suffix: str = ".png") -> bytes:
 
 def _draw(axes: Any, rows: Sequence[Mapping[str, Any]], fits: Sequence[Mapping[str, Any]], quantity: str) -> None:
     """One panel."""
+    shown = [row[quantity] for row in rows if row[quantity]]
+    if shown:
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_ylim(min(shown) / MARGIN, max(shown) * MARGIN)  # a cost that does not move has no range of its own
     for fit in fits:
         having = [row for row in rows if row["kind"] == fit["kind"] and row[quantity]]
         if fit["quantity"] != quantity or not having:
@@ -53,11 +58,7 @@ def _draw(axes: Any, rows: Sequence[Mapping[str, Any]], fits: Sequence[Mapping[s
             axes.plot(ends, level * ends ** fit["exponent"], color=colour, linewidth=0.8, zorder=1)
         bars = [row["bake_seconds_error"] for row in having] if quantity == "bake_seconds" else None
         axes.errorbar(counts, costs, yerr=bars, color=colour, marker=marker, linestyle="none", label=label, zorder=2)
-    shown = [row[quantity] for row in rows if row[quantity]]
     if shown:
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.set_ylim(min(shown) / MARGIN, max(shown) * MARGIN)  # a cost that does not move has no range of its own
         axes.legend(fontsize=8)
     axes.set_xlabel("triangles")
     axes.set_ylabel(QUANTITY_TITLES[quantity])

@@ -71,7 +71,7 @@ class Sample(Protocol):
 
 def run_cost_curves(
     scene: Scene, settings: Settings, budget: CurveBudget, progress: Progress,
-    open_sample: Callable[[CostRequest], Sample] = CostSample,
+    open_sample: Callable[[CostRequest, Callable[[str], None]], Sample] = CostSample,
 ) -> dict[str, Any]:  # fmt: skip
     """Measures all kinds at all numbers of triangles.
 
@@ -97,9 +97,10 @@ def run_cost_curves(
         samples: list[Sample] = []
         with progress.track("cost curves", len(requests)) as advance:
             for kind, request in requests:
-                samples.append(open_sample(request))
+                what = f"{kind} at {request.target:,}"
+                samples.append(open_sample(request, lambda step, what=what: advance(0.0, f"{what}: {step}")))  # type: ignore[misc]
                 stack.callback(samples[-1].close)
-                advance(note=f"{kind} at {request.target:,}")
+                advance(note=what)
         rows = [{"kind": kind, **sample.figures} for (kind, _), sample in zip(requests, samples, strict=True)]
         queried = {
             str(index): sample.frame for index, sample in enumerate(samples)

@@ -10,6 +10,7 @@ import multiprocessing
 import resource
 import tempfile
 import time
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -60,11 +61,16 @@ class CostRequest:
 class CostSample:
     """A measured scene, ready to render frames; `figures` says what it cost. Lives until `close`.
 
+    Args:
+        request: what to measure.
+        told: called with what the process is at.
+
     Raises:
         WorkerError: the process refused, or died.
     """
 
-    def __init__(self, request: CostRequest) -> None:
+    def __init__(self, request: CostRequest, told: Callable[[str], None] = lambda step: None) -> None:
+        self._told = told
         context = multiprocessing.get_context("spawn")  # Dr.Jit's threads do not survive a fork
         self._connection, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, request), daemon=True)
@@ -93,6 +99,9 @@ class CostSample:
     def _answer(self) -> dict[str, Any]:
         try:
             kind, value = self._connection.recv()
+            while kind == "step":
+                self._told(value)
+                kind, value = self._connection.recv()
         except (EOFError, ConnectionError) as error:
             self._process.join(END_S)
             raise WorkerError(
@@ -108,7 +117,8 @@ class CostSample:
 def _serve(connection: Connection, request: CostRequest) -> None:
     with tempfile.TemporaryDirectory(prefix="lightwell-cost-") as folder:
         try:
-            program, camera, figures = measure(request, Store.open(folder, create=True))
+            store = Store.open(folder, create=True)
+            program, camera, figures = measure(request, store, lambda step: connection.send(("step", step)))
         except Exception as error:  # whatever it is, the asking process must not wait for ever
             connection.send(("refused", f"costs at {request.target:,} triangles: {type(error).__name__}: {error}"))
             return
@@ -123,36 +133,43 @@ def _serve(connection: Connection, request: CostRequest) -> None:
         connection.send(("done", {}))
 
 
-def measure(request: CostRequest, store: Store) -> tuple[QueryProgram | None, Any, dict[str, Any]]:
+def measure(
+    request: CostRequest, store: Store, told: Callable[[str], None] = lambda step: None
+) -> tuple[QueryProgram | None, Any, dict[str, Any]]:
     """Measures in this process.
 
     Args:
         request: what.
         store: where the sample is baked; of no use afterwards.
+        told: called at the start of every step.
 
     Returns:
         The query (None where its caches are larger than allowed), a camera for it, and the figures: seconds, paths,
         bytes and counts, JSON-like.
     """
+    told("scene")
     settings = Settings.from_json(request.settings)
     scene = load_scene(request.source, width=settings.width, height=settings.height)
     scene, triangles, rule = with_triangles(scene, request.target)
     store.register_scene(scene.digest, {"name": scene.name, "source": str(scene.source)})
     run = RunState(scene, store, settings)
+    told("elements")
     elements, elements_s = _timed_elements(run)
     figures: dict[str, Any] = {
         "target": request.target, "triangles": triangles, "rule": rule, "elements": elements.num_elements,
         "directional_elements": len(elements.glossy), "spacing_px": elements.spacing_px,
         "elements_seconds": elements_s, "elements_nbytes": store.nbytes(elements_ref(run)),
     }  # fmt: skip
-    lobes = {
-        name: _sampled_bake(run, elements, name, found, request) for name, found in bake_sets(run, elements).items()
-    }
+    lobes = {}
+    for name, found in bake_sets(run, elements).items():
+        told(f"bake {name}")
+        lobes[name] = _sampled_bake(run, elements, name, found, request)
     for total in ("bake_paths", "bake_seconds", "cache_nbytes"):
         figures[total] = sum(lobe[total] for lobe in lobes.values())
     figures["bake_seconds_error"] = float(np.sqrt(sum(lobe["bake_seconds_error"] ** 2 for lobe in lobes.values())))
     figures["sampled_paths"] = sum(lobe["sampled_paths"] for lobe in lobes.values())
     figures["nbytes"] = figures["cache_nbytes"] + figures["elements_nbytes"]
+    told("query")
     program, camera = None, scene.camera.resized(*request.frame_size)
     figures["memory_nbytes"] = None
     if _stand_in_nbytes(settings, elements) <= request.memory_nbytes:

@@ -1,5 +1,6 @@
 """Cost curves: fits against known powers, rows from stand-ins, and one real sample of `tiny`."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -38,7 +39,8 @@ class Fake:
 
     closed: ClassVar[list[int]] = []
 
-    def __init__(self, asked: CostRequest) -> None:
+    def __init__(self, asked: CostRequest, told: Callable[[str], None]) -> None:
+        told("bake")
         n, power = asked.target, 1.0 if asked.settings["cache"]["elements"] == "triangle" else 0.0
         self.asked, self.frames = asked, 0
         self.figures = {
@@ -80,10 +82,10 @@ def test_curves_of_known_powers(tiny: Scene) -> None:
 
 def test_samples_are_closed_where_one_refuses(tiny: Scene) -> None:
     class Refusing(Fake):
-        def __init__(self, asked: CostRequest) -> None:
+        def __init__(self, asked: CostRequest, told: Callable[[str], None]) -> None:
             if asked.target == 1000:
                 raise WorkerError("too many")
-            super().__init__(asked)
+            super().__init__(asked, told)
 
     Fake.closed.clear()
     with pytest.raises(WorkerError, match="too many"):
@@ -137,9 +139,11 @@ def test_scaled_sample_agrees_with_the_whole(tmp_path: Path, monkeypatch: pytest
 
 @pytest.mark.slow
 def test_sample_in_a_process_of_its_own() -> None:
-    sample = CostSample(request(400))
+    steps: list[str] = []
+    sample = CostSample(request(400), steps.append)
     sample.frame()
     sample.close()
+    assert steps == ["scene", "elements", "bake diffuse", "bake directional", "query"]
     assert sample.figures["elements"] > 0
     with pytest.raises(WorkerError, match="SceneError"):
         CostSample(request(400, source="nowhere.xml"))
