@@ -15,7 +15,6 @@ Lights and analytic shapes stay as they are.
 import dataclasses
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,37 +22,15 @@ from numpy.typing import NDArray
 
 from workers.backend import mi
 from workers.errors import WorkerError
-from workers.mesh_building import to_mitsuba
+from workers.mesh_table import Faces, Floats, MeshTable, build_mesh, read_mesh
 from workers.scene import Scene
 from workers.scene_check import bounds
 
-Floats = NDArray[np.float64]
-Faces = NDArray[np.int64]
 VERSION = 1
 CLOSE_ENOUGH = 0.02  # of the count that was asked for: the scene is taken as it is
 MAX_DIVISIONS = 256
 STEPS = 40  # of a bisection
-_STANDARD = ("vertex_positions", "vertex_normals", "vertex_texcoords")
 AS_FILED, TESSELLATED, CLUSTERED = "as in the file", "tessellated", "vertices clustered"
-
-
-@dataclass(frozen=True, eq=False)
-class Mesh:
-    """A mesh as one table.
-
-    Attributes:
-        shape: the Mitsuba mesh that it comes from.
-        columns: everything that vertices carry, positions first, float64 [vertices, columns].
-        widths: names of what the columns hold and how many each takes.
-        faces: vertex indices, int64 [triangles, 3].
-        parents: triangle of the original mesh that each one is part of, int64 [triangles].
-    """
-
-    shape: Any
-    columns: Floats
-    widths: dict[str, int]
-    faces: Faces
-    parents: NDArray[np.int64]
 
 
 def num_triangles(mi_scene: Any) -> int:
@@ -95,29 +72,10 @@ def with_triangles(scene: Scene, target: int) -> tuple[Scene, int, str]:
     return renamed, count, rule
 
 
-def read_mesh(shape: Any) -> Mesh:
-    """The arrays of a Mitsuba mesh."""
-    num_vertices = int(shape.vertex_count())
-    parts = {"vertex_positions": shape.vertex_positions_buffer()}
-    if shape.has_vertex_normals():
-        parts["vertex_normals"] = shape.vertex_normals_buffer()
-    if shape.has_vertex_texcoords():
-        parts["vertex_texcoords"] = shape.vertex_texcoords_buffer()
-    parameters = mi.traverse(shape)
-    for key in sorted(parameters.keys()):
-        if key.startswith("vertex_") and key not in _STANDARD:
-            parts[key] = parameters[key]
-    tables = {name: np.array(part, dtype=np.float64).reshape(num_vertices, -1) for name, part in parts.items()}
-    faces = np.array(shape.faces_buffer(), dtype=np.int64).reshape(-1, 3)
-    columns = np.column_stack(list(tables.values()))
-    widths = {name: table.shape[1] for name, table in tables.items()}
-    return Mesh(shape, columns, widths, faces, np.arange(len(faces)))
-
-
 # ------------------------------------------------------- more -------------------------------------------------------
 
 
-def tessellated(meshes: list[Mesh], target: int, diagonal: float) -> list[Mesh]:
+def tessellated(meshes: list[MeshTable], target: int, diagonal: float) -> list[MeshTable]:
     """Meshes with about `target` triangles, by cutting the longest ones.
 
     Args:
@@ -135,7 +93,7 @@ def tessellated(meshes: list[Mesh], target: int, diagonal: float) -> list[Mesh]:
     return [_cut(mesh, _divisions(edge, length)) for mesh, edge in zip(meshes, edges, strict=True)]
 
 
-def _longest_edges(mesh: Mesh) -> Floats:
+def _longest_edges(mesh: MeshTable) -> Floats:
     corners = mesh.columns[:, :3][mesh.faces]
     return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
 
@@ -144,7 +102,7 @@ def _divisions(edges: Floats, length: float) -> NDArray[np.int64]:
     return np.clip(np.ceil(edges / length), 1, MAX_DIVISIONS).astype(np.int64)
 
 
-def _cut(mesh: Mesh, divisions: NDArray[np.int64]) -> Mesh:
+def _cut(mesh: MeshTable, divisions: NDArray[np.int64]) -> MeshTable:
     if (divisions == 1).all():
         return mesh
     points, faces, parents, offset = [], [], [], 0
@@ -162,7 +120,9 @@ def _cut(mesh: Mesh, divisions: NDArray[np.int64]) -> Mesh:
     whole_rows = rows.view(np.dtype((np.void, rows.strides[0]))).reshape(-1)  # compared as bytes: many times faster
     _, first, place = np.unique(whole_rows, return_index=True, return_inverse=True)
     columns = rows[first].astype(np.float64)
-    return Mesh(mesh.shape, columns, mesh.widths, place.reshape(-1)[np.concatenate(faces)], np.concatenate(parents))
+    return MeshTable(
+        mesh.shape, columns, mesh.widths, place.reshape(-1)[np.concatenate(faces)], np.concatenate(parents)
+    )
 
 
 def _lattice(k: int) -> tuple[NDArray[np.int64], Faces]:
@@ -175,7 +135,7 @@ def _lattice(k: int) -> tuple[NDArray[np.int64], Faces]:
     return weights, np.array(faces, np.int64)
 
 
-def _interpolated(mesh: Mesh, faces: Faces, weights: NDArray[np.int64], k: int) -> Floats:
+def _interpolated(mesh: MeshTable, faces: Faces, weights: NDArray[np.int64], k: int) -> Floats:
     """[triangles * points, columns]; corners are added in the order of their index, so that two triangles give the
     points of their common edge bit by bit."""
     order = np.argsort(faces, axis=1)
@@ -189,7 +149,7 @@ def _interpolated(mesh: Mesh, faces: Faces, weights: NDArray[np.int64], k: int) 
 # ------------------------------------------------------ fewer ------------------------------------------------------
 
 
-def clustered(meshes: list[Mesh], target: int, diagonal: float) -> list[Mesh]:
+def clustered(meshes: list[MeshTable], target: int, diagonal: float) -> list[MeshTable]:
     """Meshes with about `target` triangles, or as few as clustering gives; arguments as `tessellated`."""
 
     def total(cell: float) -> int:
@@ -199,13 +159,13 @@ def clustered(meshes: list[Mesh], target: int, diagonal: float) -> list[Mesh]:
     return [_merged(mesh, cell) for mesh in meshes]
 
 
-def _merged(mesh: Mesh, cell: float) -> Mesh:
+def _merged(mesh: MeshTable, cell: float) -> MeshTable:
     faces, chosen = _merged_faces(mesh, cell)
     used, place = np.unique(faces, return_inverse=True)
-    return Mesh(mesh.shape, mesh.columns[used], mesh.widths, place.reshape(-1, 3), mesh.parents[chosen])
+    return MeshTable(mesh.shape, mesh.columns[used], mesh.widths, place.reshape(-1, 3), mesh.parents[chosen])
 
 
-def _merged_faces(mesh: Mesh, cell: float) -> tuple[Faces, NDArray[np.int64]]:
+def _merged_faces(mesh: MeshTable, cell: float) -> tuple[Faces, NDArray[np.int64]]:
     """Triangles between the vertices that stand for their clusters, and which of the mesh's they are."""
     faces = _stand_ins(mesh, cell)[mesh.faces]
     a, b, c = faces.T
@@ -217,7 +177,7 @@ def _merged_faces(mesh: Mesh, cell: float) -> tuple[Faces, NDArray[np.int64]]:
     return faces[chosen], chosen
 
 
-def _stand_ins(mesh: Mesh, cell: float) -> NDArray[np.int64]:
+def _stand_ins(mesh: MeshTable, cell: float) -> NDArray[np.int64]:
     """For each vertex the one that stands for its cluster."""
     positions = mesh.columns[:, :3]
     keys = np.floor((positions - positions.min(axis=0)) / cell).astype(np.int64)
@@ -249,26 +209,12 @@ def _nearest(total: Callable[[float], int], target: int, low: float, high: float
     return best
 
 
-def _rebuilt(mi_scene: Any, meshes: dict[str, Mesh]) -> Any:
+def _rebuilt(mi_scene: Any, meshes: dict[str, MeshTable]) -> Any:
     """A scene of the same materials, lights and analytic shapes around other meshes."""
     parts: dict[str, Any] = {"type": "scene"}
     for shape in mi_scene.shapes():
-        parts[shape.id()] = _built(meshes[shape.id()]) if shape.id() in meshes else shape
+        parts[shape.id()] = build_mesh(meshes[shape.id()]) if shape.id() in meshes else shape
     for index, emitter in enumerate(mi_scene.emitters()):
         if emitter.get_shape() is None:
             parts[f"light {index}"] = emitter
     return mi.load_dict(parts)
-
-
-def _built(mesh: Mesh) -> Any:
-    ends = np.cumsum(list(mesh.widths.values()))
-    tables = dict(zip(mesh.widths, np.split(mesh.columns, ends[:-1], axis=1), strict=True))
-    attributes = {name: table for name, table in tables.items() if name not in _STANDARD}
-    parameters, num_faces = mi.traverse(mesh.shape), int(mesh.shape.face_count())
-    for key in sorted(parameters.keys()):
-        if key.startswith("face_"):
-            attributes[key] = np.array(parameters[key]).reshape(num_faces, -1)[mesh.parents]
-    return to_mitsuba(
-        mesh.shape.id(), tables["vertex_positions"], mesh.faces, normals=tables.get("vertex_normals"),
-        texcoords=tables.get("vertex_texcoords"), bsdf=mesh.shape.bsdf(), attributes=attributes,
-    )  # fmt: skip

@@ -6,15 +6,14 @@ import pytest
 from workers.backend import mi
 from workers.errors import WorkerError
 from workers.mesh_building import to_mitsuba
+from workers.mesh_table import MeshTable, read_mesh
 from workers.scene import Scene, load_scene
 from workers.triangle_count import (
     AS_FILED,
     CLUSTERED,
     TESSELLATED,
-    Mesh,
     clustered,
     num_triangles,
-    read_mesh,
     tessellated,
     with_triangles,
 )
@@ -25,7 +24,7 @@ def tiny() -> Scene:
     return load_scene("tiny", width=32, height=32)
 
 
-def areas(mesh: Mesh) -> np.ndarray:
+def areas(mesh: MeshTable) -> np.ndarray:
     corners = mesh.columns[:, :3][mesh.faces]
     return np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
 
@@ -36,7 +35,7 @@ def render(scene: Scene) -> np.ndarray:
     return np.array(mi.render(scene.mi_scene, integrator=integrator, sensor=sensor, spp=4, seed=1))
 
 
-def square(**attributes: np.ndarray) -> Mesh:
+def square(**attributes: np.ndarray) -> MeshTable:
     """Two triangles of a unit square."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     shape = to_mitsuba("square", corners, [[0, 1, 2], [0, 2, 3]], attributes=attributes)
@@ -72,7 +71,7 @@ def test_tessellation_interpolates_what_vertices_carry() -> None:
 
 def test_tessellation_cuts_the_long_ones_first() -> None:
     small = square()
-    small = Mesh(small.shape, small.columns * 0.1, small.widths, small.faces, small.parents)
+    small = MeshTable(small.shape, small.columns * 0.1, small.widths, small.faces, small.parents)
     large, untouched = tessellated([square(), small], 34, 1.0)
     assert len(large.faces) == 32 and len(untouched.faces) == 2
 
@@ -96,7 +95,7 @@ def test_clustering_leaves_no_shape_without_triangles(tiny: Scene) -> None:
 
 def test_clustering_drops_what_repeats() -> None:
     mesh = square()
-    twice = Mesh(mesh.shape, mesh.columns, mesh.widths, np.concatenate([mesh.faces] * 2), np.arange(4))
+    twice = MeshTable(mesh.shape, mesh.columns, mesh.widths, np.concatenate([mesh.faces] * 2), np.arange(4))
     (merged,) = clustered([twice], 2, 1.0)
     assert len(merged.faces) == 2
 
