@@ -4,6 +4,7 @@ A picture of a few kilobytes can claim terabytes of pixels, a mesh header any nu
 what a header claims, so the claims are compared with what the file can hold.
 """
 
+import math
 import re
 import struct
 from pathlib import Path
@@ -18,6 +19,9 @@ _RGBE_SIZE = re.compile(rb"\n[-+][XY] +(\d{1,9}) +[-+][XY] +(\d{1,9})\s*\n")
 _PFM_SIZE = re.compile(rb"P[Ff]\s+(\d{1,9})\s+(\d{1,9})\s")
 _PLY_COUNT = re.compile(rb"^element[ \t]+(\S+)[ \t]+(\S+)", re.MULTILINE)
 _BYTES_OF_TYPE = {1: 4, 2: 2, 3: 1}  # of a .vol grid: float32, float16, uint8
+_TENSORS = b"tensor_file\x00\x01\x00"
+_TENSOR_NBYTES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 8, 8: 8, 9: 2, 10: 4, 11: 8}  # by the number of its type
+_MAX_TENSORS, _MAX_TENSOR_AXES = 64, 8
 
 
 def check_asset(plugin: str, path: Path, where: str) -> None:
@@ -35,6 +39,8 @@ def check_asset(plugin: str, path: Path, where: str) -> None:
         _check_grid(path, where)
     elif plugin == "serialized" and not _start(path).startswith(_SERIALIZED):
         raise BundleError(where, "must name a serialized mesh", "a file of another kind")
+    elif plugin == "measured":
+        _check_tensors(path, where)
 
 
 def _start(path: Path) -> bytes:
@@ -127,3 +133,26 @@ def _check_grid(path: Path, where: str) -> None:
         claimed *= max(count, 0)
     if min(counts) < 1 or claimed > path.stat().st_size:
         raise HostileBundleError(where, "must name a grid that holds what it claims", f"{claimed} bytes")
+
+
+def _check_tensors(path: Path, where: str) -> None:
+    """A measured material: a table of named tensors (name, axes, type, offset, shape), each within the file."""
+    start, nbytes = _start(path), path.stat().st_size
+    rule = "must name a measured material whose tensors lie in the file"
+    try:
+        (num_tensors,) = struct.unpack_from("<I", start, len(_TENSORS))
+        place = len(_TENSORS) + 4
+        if not start.startswith(_TENSORS) or num_tensors > _MAX_TENSORS:
+            raise BundleError(where, "must name a measured material", "a file of another kind")
+        for _ in range(num_tensors):
+            (name_nbytes,) = struct.unpack_from("<H", start, place)
+            num_axes, kind, offset = struct.unpack_from("<HBQ", start, place + 2 + name_nbytes)
+            if num_axes > _MAX_TENSOR_AXES or kind not in _TENSOR_NBYTES:
+                raise BundleError(where, rule, f"one of type {kind} with {num_axes} axes")
+            shape = struct.unpack_from(f"<{num_axes}Q", start, place + 13 + name_nbytes)
+            end = offset + _TENSOR_NBYTES[kind] * math.prod(shape)
+            if end > nbytes:
+                raise HostileBundleError(where, rule, f"one up to byte {end} of {nbytes}")
+            place += 13 + name_nbytes + 8 * num_axes
+    except struct.error:
+        raise BundleError(where, rule, "a table that is cut off") from None

@@ -23,4 +23,6 @@ def preview_png(store: Store, ref: UnitRef) -> bytes | None:
     radiance = layers.get("denoised", layers["radiance"])
     step = -(-max(radiance.shape[:2]) // MAX_EDGE_PX)
     small = np.ascontiguousarray(radiance[::step, ::step])
-    return encode_pixels(display_image(small, exposure_from_luminance([luminance(small)])))
+    finite = small[np.isfinite(small).all(axis=-1)]  # what is not is counted and told by the frame's own record
+    exposure = exposure_from_luminance([luminance(finite)]) if finite.size else 1.0
+    return encode_pixels(display_image(small, exposure))

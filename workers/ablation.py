@@ -16,6 +16,7 @@ from workers.element_stage import run_elements
 from workers.elements import ElementSet
 from workers.evaluate import load_reference, mean_score
 from workers.inputs import run_inputs
+from workers.network_record import load_network
 from workers.progress import Progress
 from workers.query import CHANNELS, QueryProgram
 from workers.reconstruct import Reconstructor
@@ -23,7 +24,7 @@ from workers.render import load_render, run_render
 from workers.run_state import RunState
 from workers.scene import Scene
 from workers.settings import Settings
-from workers.train import load_network, run_train
+from workers.train import run_train
 
 PAPER: dict[str, Any] = {
     "cache.elements": "triangle", "cache.lobes": "exitant", "cache.azimuth": 64, "cache.polar": 16,

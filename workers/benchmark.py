@@ -20,6 +20,7 @@ from workers.denoise import QUALITIES, denoise
 from workers.element_stage import run_elements
 from workers.elements import ElementSet
 from workers.errors import WorkerError
+from workers.network_record import load_network
 from workers.pathtrace import trace
 from workers.primary import DeviceCamera
 from workers.progress import Progress
@@ -30,7 +31,6 @@ from workers.run_state import RunState
 from workers.scene import Scene
 from workers.settings import Settings
 from workers.timing import interleaved_medians, matmul_gflop_per_s, other_load
-from workers.train import load_network
 
 PATH_TRACER = "mi.render path"
 _SEED = 1

@@ -28,10 +28,10 @@ from storage.store import Store, UnitRef
 from workers.errors import WorkerError
 from workers.inputs import FILE as INPUTS_FILE
 from workers.inputs import STAGE as INPUTS_STAGE
+from workers.network_record import read_network
 from workers.query import CHANNELS, NUM_CHANNELS
 from workers.reconstruct import Encoding, FrameModule
 from workers.train import STAGE as TRAIN_STAGE
-from workers.train import read_network
 
 DEFAULT_TOLERANCE = 1e-4
 OPSET = 18

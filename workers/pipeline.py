@@ -18,6 +18,7 @@ from workers.elements import ElementSet
 from workers.errors import WorkerError
 from workers.evaluate import Evaluation, Picture, run_evaluation
 from workers.inputs import inputs_ref, run_inputs
+from workers.network_record import WEIGHTS_FILE, load_network
 from workers.plan import plan_rows
 from workers.progress import Progress
 from workers.query import QueryProgram
@@ -27,7 +28,7 @@ from workers.renderer import FrameRenderer, publish
 from workers.run_state import RunState
 from workers.scene import Scene
 from workers.settings import Settings
-from workers.train import WEIGHTS_FILE, load_network, run_train, train_ref
+from workers.train import run_train, train_ref
 
 __all__ = ["Evaluation", "Picture", "evaluate_scene", "plan_scene", "run_scene"]
 

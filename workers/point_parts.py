@@ -18,12 +18,12 @@ from workers.bake import bake_refs, load_caches
 from workers.element_stage import elements_ref, run_elements
 from workers.elements import ElementSet
 from workers.footprint import network_nbytes, program_nbytes
+from workers.network_record import load_network
 from workers.operating_points import OperatingPoint
 from workers.query import CHANNELS, CacheArrays, QueryProgram
 from workers.reconstruct import Reconstructor
 from workers.run_state import RunState
 from workers.settings import Settings
-from workers.train import load_network
 from workers.upsample import HalfScaleReconstructor
 
 Reconstruct = Callable[[np.ndarray], np.ndarray]

@@ -1,7 +1,9 @@
 """Inference: queried features to a frame, with precision and compilation chosen by measurement."""
 
 import time
+from collections import OrderedDict
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,10 @@ from workers.query import CHANNELS
 # bf16 is used only where its frame is this close to fp32's: far below what any reference can resolve.
 BF16_GATE_DB = 50.0
 PROBE_REPEATS = 3
+MAX_SIZES = 16
+"""Frame sizes whose choice is remembered; the one that was asked for longest ago is measured again."""
+MAX_COMPILED = 8
+"""Frame sizes that are compiled at most: torch keeps each of a module's programs until the process ends."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +95,8 @@ class Reconstructor:
         network: the network, fp32.
         encoding: its transfer functions.
         precision: "fp32", "bf16" or "auto" (bf16 where it passes `BF16_GATE_DB` and is faster).
-        compile: try `torch.compile` and keep it where it is faster; costs tens of seconds a size.
+        compile: try `torch.compile` and keep it where it is faster; costs tens of seconds a size. Sizes beyond the
+            first `MAX_COMPILED` run without.
     """
 
     def __init__(
@@ -100,41 +107,49 @@ class Reconstructor:
         self.config: NetworkConfig = network.config
         self._fp32 = FrameModule(channels_last(network.eval()), encoding)
         self._precision, self._compile = precision, compile
-        self._chosen: dict[tuple[int, int], Any] = {}
-        self.choices: dict[str, str] = {}
+        self._chosen: OrderedDict[tuple[int, int], tuple[str, Any]] = OrderedDict()  # the latest size last
+        self._num_compiled = 0
+
+    @property
+    def choices(self) -> dict[str, str]:
+        """What was chosen for the sizes that are remembered: {"640x360": "bf16 compiled"}."""
+        return {f"{width}x{height}": name for (height, width), (name, _) in self._chosen.items()}
 
     def __call__(self, features: np.ndarray) -> np.ndarray:
         """float32 [height, width, NUM_CHANNELS] to linear radiance, float32 [height, width, 3]."""
-        height, width = features.shape[:2]
+        size: tuple[int, int] = features.shape[0], features.shape[1]
         with pool_at_rest(), torch.inference_mode():
             tensor = torch.from_numpy(features).to(self.device, non_blocking=True)
-            if (height, width) not in self._chosen:
-                self._chosen[height, width] = self._choose(tensor, (height, width))
-            return self._chosen[height, width](tensor).cpu().numpy()
+            if size not in self._chosen:
+                self._chosen[size] = self._choose(tensor)
+            self._chosen.move_to_end(size)
+            if len(self._chosen) > MAX_SIZES:
+                self._chosen.popitem(last=False)
+            _, module = self._chosen[size]
+            return module(tensor).cpu().numpy()
 
-    def _choose(self, features: Tensor, size: tuple[int, int]) -> Any:
-        """Measures the candidates on real input of this size, once."""
+    def _choose(self, features: Tensor) -> tuple[str, Any]:
+        """Measures the candidates on real input of a size; returns the best one's name and itself."""
         candidates: dict[str, Any] = {"fp32": self._fp32}
-        if self._precision != "fp32":
-            bf16 = self._bf16()
-            if self._passes_gate(bf16, features):
-                candidates["bf16"] = bf16
+        if self._precision != "fp32" and self._passes_gate(self._bf16, features):
+            candidates["bf16"] = self._bf16
         if self._precision == "bf16" and "bf16" in candidates:
             del candidates["fp32"]
         if len(candidates) == 1 and not self._compile:  # nothing to measure
-            ((self.choices[f"{size[1]}x{size[0]}"], module),) = candidates.items()
-            return module
+            return next(iter(candidates.items()))
         times = {name: _seconds(module, features) for name, module in candidates.items()}
         best = min(times, key=lambda name: times[name])
         module = candidates[best]
-        if self._compile:
+        if self._compile and self._num_compiled < MAX_COMPILED:
+            self._num_compiled += 1
             compiled = _try_compile(module, features)
             if compiled is not None and _seconds(compiled, features) < times[best]:
                 module, best = compiled, f"{best} compiled"
-        self.choices[f"{size[1]}x{size[0]}"] = best
-        return module
+        return best, module
 
+    @cached_property
     def _bf16(self) -> FrameModule:
+        """One copy of the network for all sizes."""
         network = FusionNet(self.config).to(self.device)
         network.load_state_dict(self._fp32.network.state_dict())
         return FrameModule(channels_last(network.eval().to(torch.bfloat16)), self.encoding)

@@ -15,6 +15,7 @@ from workers.code_versions import ENTRY, check_versions, code_versions
 from workers.element_stage import run_elements
 from workers.errors import WorkerError
 from workers.footprint import scene_nbytes
+from workers.network_record import load_network
 from workers.progress import Progress
 from workers.published import renderable_scenes
 from workers.query import CHANNELS, QueryProgram
@@ -22,7 +23,6 @@ from workers.reconstruct import Reconstructor
 from workers.run_state import RunState
 from workers.scene import load_scene
 from workers.settings import Settings
-from workers.train import load_network
 
 __all__ = ["Frame", "FrameRenderer", "open_run", "publish", "renderable_scenes"]
 

@@ -8,7 +8,6 @@ A source may end in a variation, "tabletop#seed=3,materials=0.5" (`workers/varia
 
 import hashlib
 import json
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,12 +17,10 @@ from typing import Any
 import numpy as np
 
 from workers.backend import mi
-from workers.builtin_scenes import BUILTIN_SCENES, read_builtin
 from workers.camera import Camera
 from workers.errors import SceneError
 from workers.scene_check import bounds, check_scene
 from workers.scene_draft import SceneDraft
-from workers.scene_mesh import MESH_SUFFIXES, read_mesh
 from workers.scene_nodes import (
     audit_nodes,
     first_sensor,
@@ -34,9 +31,8 @@ from workers.scene_nodes import (
     sensor_pose,
     set_film_size,
 )
+from workers.scene_source import read_source
 from workers.scene_variation import content_of, vary_scene
-from workers.scene_xml import read_xml
-from workers.scene_yaml import YAML_SUFFIXES, read_yaml
 from workers.variation import Variation, split_source
 from workers.world_frame import OWN, WorldFrame, dim_lights, move_nodes, suitable_frame
 
@@ -199,7 +195,7 @@ class _Parsed:
 
 
 def _parse(source: str | Path, width: int | None, height: int | None) -> _Parsed:
-    name, draft = _read(source)
+    name, draft = read_source(source)
     draft.notes += audit_nodes(draft.state, draft.what)
     name_shapes(draft.state)
     sensor, sensor_notes = first_sensor(draft.state, draft.what)
@@ -212,37 +208,6 @@ def _parse(source: str | Path, width: int | None, height: int | None) -> _Parsed
         pose, pose_notes = sensor_pose(sensor, draft.what)
         draft.notes += pose_notes
     return _Parsed(name, draft, sensor, pose, pixels)
-
-
-def _read(source: str | Path) -> tuple[str, SceneDraft]:
-    """Choose the reader; returns the scene's slug and its draft."""
-    builtin = str(source).removeprefix("builtin:")
-    if builtin in BUILTIN_SCENES and not Path(str(source)).is_file():
-        return builtin, read_builtin(builtin)
-    if str(source).startswith("builtin:"):
-        raise SceneError(f"built-in scene must be one of {', '.join(sorted(BUILTIN_SCENES))}, got {builtin!r}")
-    path = Path(source)
-    if path.is_dir():
-        path = path / "scene.xml"
-    suffix = path.suffix.lower()
-    readers = {
-        ".xml": read_xml,
-        **dict.fromkeys(YAML_SUFFIXES, read_yaml),
-        **dict.fromkeys(MESH_SUFFIXES, read_mesh),
-    }
-    if suffix not in readers:
-        raise SceneError(
-            f"scene must be a {', '.join(sorted(readers))} file or one of "
-            f"{', '.join(sorted(BUILTIN_SCENES))}, got {str(source)!r}"
-        )
-    if not path.is_file():
-        raise SceneError(f"scene file must exist, got {str(source)!r}; check the path")
-    stem = path.resolve().parent.name if path.stem == "scene" else path.stem
-    return _slug(stem), readers[suffix](path)
-
-
-def _slug(text: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-") or "scene"
 
 
 def _built(draft: SceneDraft, parse_again: Callable[[], SceneDraft]) -> tuple[Any, WorldFrame]:

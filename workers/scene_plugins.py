@@ -1,9 +1,9 @@
 """The Mitsuba plugins that a scene may name, for whoever must decide before Mitsuba sees it.
 
 Mitsuba turns a plugin's name into the path of a shared library, so a name that nobody has looked at is code
-that nobody has looked at. Everything in `PLUGINS` was built once through `load_scene`; what is left out is in
-`REFUSED_PLUGINS` with its reason. `tests/workers/test_scene_plugins.py` holds that the two together are all that
-the installed Mitsuba has.
+that nobody has looked at. `tests/workers/test_scene_plugins.py` builds everything in `PLUGINS` through `load_scene`.
+What is left out is in `REFUSED_PLUGINS` with its reason; the same test holds that the two together are all that the
+installed Mitsuba has.
 """
 
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from workers.errors import SceneError
-from workers.scene import _read
 from workers.scene_nodes import audit_nodes, first_sensor, set_film_size
+from workers.scene_source import read_source
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +33,7 @@ def read_scene_request(source: str) -> SceneRequest:
     Raises:
         SceneError: the file is missing or broken, or holds what caches cannot represent.
     """
-    name, draft = _read(source)
+    name, draft = read_source(source)
     audit_nodes(draft.state, draft.what)
     sensor, _ = first_sensor(draft.state, draft.what)
     if sensor is None and draft.make_camera is None:

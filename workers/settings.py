@@ -1,14 +1,14 @@
 """Every number that a run can choose, with presets; checked before any work starts."""
 
 import dataclasses
-import math
-import types
 import typing
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Literal, Self
 
 from workers.errors import WorkerError
+from workers.presets import PRESET_OVERRIDES
+from workers.setting_values import RANGES, converted, out_of_range
 
 
 class SettingsError(WorkerError, ValueError):
@@ -174,15 +174,15 @@ class Settings:
         Raises:
             SettingsError: no preset has that name.
         """
-        if name not in _PRESETS:
-            raise SettingsError(f"preset must be one of {', '.join(_PRESETS)}, got {name!r}")
-        return Settings(preset=name).override(_PRESETS[name])
+        if name not in PRESET_OVERRIDES:
+            raise SettingsError(f"preset must be one of {', '.join(PRESET_OVERRIDES)}, got {name!r}")
+        return Settings(preset=name).override(PRESET_OVERRIDES[name])
 
     def override(self, values: dict[str, Any]) -> Self:
         """A copy with dotted keys ("cache.diffuse_spp") set; strings are converted to the field's type.
 
         Raises:
-            SettingsError: unknown key or a value that does not fit.
+            SettingsError: unknown key, a value that does not fit, or one outside its range (`setting_values.RANGES`).
         """
         result = self
         for key, value in values.items():
@@ -214,34 +214,7 @@ def _dotted(value: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]
             yield f"{prefix}{name}", item
 
 
-_PRESETS: dict[str, dict[str, Any]] = {
-    "draft": {},
-    "balanced": {
-        "cache.max_elements": 150_000, "cache.diffuse_spp": 4096, "cache.directional_spp": 16,
-        "frames.num_train": 72, "frames.num_validation": 8, "frames.num_test": 12, "frames.train_spp": 256,
-        "frames.test_spp": 4096, "train.seconds": 3600.0, "train.epochs": 1000,
-    },
-    "reference": {
-        "cache.max_elements": 400_000, "cache.diffuse_spp": 16_384, "cache.azimuth": 64, "cache.polar": 16,
-        "cache.directional_spp": 32, "frames.num_train": 90, "frames.num_validation": 10, "frames.num_test": 200,
-        "frames.train_spp": 4000, "frames.denoise_train": False, "frames.test_spp": 4000,
-        "train.seconds": 0.0, "train.epochs": 1000, "train.widths": (48, 64, 96),
-    },
-    "demo": {
-        "width": 256, "height": 256, "cache.max_elements": 40_000, "cache.diffuse_spp": 512,
-        "frames.num_train": 24, "frames.num_validation": 3, "frames.num_test": 4, "frames.train_spp": 64,
-        "frames.test_spp": 512, "train.seconds": 200.0,
-    },
-    "tiny": {
-        "width": 64, "height": 64, "cache.max_elements": 1500, "cache.domain_poses": 4, "cache.diffuse_spp": 64,
-        "cache.azimuth": 8, "cache.polar": 4, "cache.directional_spp": 4, "frames.num_train": 4,
-        "frames.num_validation": 1, "frames.num_test": 2, "frames.train_spp": 32, "frames.test_spp": 64,
-        "frames.passes": 2, "train.epochs": 3, "train.seconds": 20.0, "train.batch": 2, "train.crop": 32,
-        "train.widths": (16, 16, 16), "evaluation.spp": (1,), "evaluation.timing_repeats": 2,
-        "evaluation.compile": False,
-    },
-}  # fmt: skip
-PRESETS = tuple(_PRESETS)
+PRESETS = tuple(PRESET_OVERRIDES)
 
 
 def _set(node: Any, path: list[str], value: Any, key: str) -> Any:
@@ -257,60 +230,24 @@ def _set(node: Any, path: list[str], value: Any, key: str) -> Any:
     if dataclasses.is_dataclass(current):
         raise SettingsError(f"setting {key!r} must name a single value; use {key}.<name>")
     kind = typing.get_type_hints(type(node))[name]
-    return dataclasses.replace(node, **{name: _convert(value, kind, key)})
-
-
-def _convert(value: Any, kind: Any, key: str) -> Any:
-    origin = typing.get_origin(kind)
     try:
-        if origin is Literal:
-            if value not in typing.get_args(kind):
-                raise ValueError(f"one of {', '.join(map(str, typing.get_args(kind)))}")
-            return value
-        if origin is tuple:
-            items = value.split(",") if isinstance(value, str) else list(value)
-            return tuple(_convert(item, typing.get_args(kind)[0], key) for item in items)
-        if kind is bool:
-            return _boolean(value)
-        if isinstance(origin, types.UnionType) or kind is str:
-            return str(value)
-        return kind(value)
-    except (TypeError, ValueError) as error:
-        rule = str(error) if origin is Literal or kind is bool else f"of type {getattr(kind, '__name__', kind)}"
-        raise SettingsError(f"setting {key!r} must be {rule}, got {value!r}") from error
-
-
-def _boolean(value: Any) -> bool:
-    if isinstance(value, bool):
-        return value
-    words = {"true": True, "1": True, "yes": True, "false": False, "0": False, "no": False}
-    if str(value).lower() not in words:
-        raise ValueError("true or false")
-    return words[str(value).lower()]
-
-
-_POSITIVE = (
-    "width", "height", "cache.max_elements", "cache.min_spacing_px", "cache.domain_poses", "cache.diffuse_spp",
-    "cache.azimuth", "cache.polar", "cache.directional_spp", "cache.passes", "cache.elements_per_unit",
-    "frames.num_train", "frames.num_validation", "frames.num_test", "frames.train_spp", "frames.test_spp",
-    "frames.passes", "train.batch", "train.crop", "train.perceptual_every", "train.epochs", "train.learning_rate",
-    "evaluation.timing_repeats",
-)  # fmt: skip
+        return dataclasses.replace(node, **{name: converted(value, kind)})
+    except ValueError as error:
+        raise SettingsError(f"setting {key!r} must be {error}, got {value!r:.100}") from error
 
 
 def _check(settings: Settings) -> None:
-    for key in _POSITIVE:
+    for key in RANGES:
         value: Any = settings
         for name in key.split("."):
             value = getattr(value, name)
-        if not 0 < value < math.inf:
-            raise SettingsError(f"setting {key!r} must be above 0 and finite, got {value}")
+        rule = out_of_range(key, value)
+        if rule is not None:
+            raise SettingsError(f"setting {key!r} must be {rule}, got {value!r:.100}")
     if settings.query.weights != "barycentric" and settings.cache.lobes != "exitant":
         raise SettingsError(
             f"setting 'query.weights' must be barycentric unless cache.lobes is exitant, got {settings.query.weights}"
         )
-    if settings.query.samples not in (1, 2, 3, 4):
-        raise SettingsError(f"setting 'query.samples' must be 1 to 4, got {settings.query.samples}")
     if settings.train.unshuffle not in (1, 2, 4):
         raise SettingsError(f"setting 'train.unshuffle' must be 1, 2 or 4, got {settings.train.unshuffle}")
     if len(settings.train.widths) != 3:

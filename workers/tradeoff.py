@@ -25,6 +25,7 @@ from workers.evaluate import (
     positions_of,
     score_row,
 )
+from workers.network_record import load_network
 from workers.operating_points import FrameTime, OperatingPoint
 from workers.operating_table import OperatingTable, save_table
 from workers.pareto import pareto_front
@@ -39,7 +40,6 @@ from workers.settings import Settings
 from workers.timing import interleaved_seconds, other_load, spread_of
 from workers.tradeoff_preparation import PreparedVariant, base_run, network_ref, prepare_variants
 from workers.tradeoff_variants import TradeoffBudget
-from workers.train import load_network
 
 Method = Callable[[Camera, int], np.ndarray]
 COSTS = ("ms", "bake_seconds", "nbytes")

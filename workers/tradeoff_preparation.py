@@ -9,6 +9,7 @@ from storage.store import UnitRef
 from workers.ablation import bake_cost
 from workers.camera import Camera
 from workers.element_stage import run_elements
+from workers.network_record import WEIGHTS_FILE, load_network
 from workers.point_parts import PointParts, Reconstruct, derived_run
 from workers.query import QueryProgram
 from workers.reconstruct import Reconstructor
@@ -23,7 +24,6 @@ from workers.tradeoff_variants import (
     train_variant,
     trained,
 )
-from workers.train import WEIGHTS_FILE, load_network
 
 
 @dataclass

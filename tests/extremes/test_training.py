@@ -18,7 +18,8 @@ from workers.errors import WorkerError
 from workers.progress import Progress
 from workers.query import CHANNELS, NUM_CHANNELS
 from workers.settings import Settings
-from workers.train import Dataset, Trainer
+from workers.trainer import Trainer
+from workers.training_data import Dataset
 
 TRAIN = {
     "train.seconds": 0.0, "train.epochs": 12, "train.precision": "fp32", "train.perceptual_weight": 0.0,

@@ -1,11 +1,14 @@
 # ruff: noqa: E501  # tables are read by the row
-"""Meshes, pictures and grids that must be refused."""
+"""Meshes, pictures, grids and measured materials that must be refused."""
 
 import json
 import struct
 from collections.abc import Iterator
 
+import numpy as np
+
 from tests.service.bundle_packing import GLTF, PLY, TRIANGLE, Hostile, glb, pack, png, scenes, xml
+from tests.workers.plugin_scenes import tensor_file
 
 
 def bad_meshes() -> Iterator[Hostile]:
@@ -100,3 +103,20 @@ def bad_pictures() -> Iterator[Hostile]:
         "serialized",
         **{"a.bin": b"text"},
     )
+    material = tensor_file(theta_i=np.zeros(2, np.float32), ndf=np.ones((2, 2), np.float32))
+    shape_at = material.index(b"ndf") + 3 + 11  # after its axes, type and offset
+    materials = {
+        "text": b"hello", "empty": b"", "cut": material[:40], "magic": b"tensor_fill" + material[11:],
+        "version": material[:12] + b"\x02" + material[13:], "many": material[:14] + b"\xff" * 4 + material[18:],
+        "long": material[:shape_at] + struct.pack("<2Q", 1 << 60, 1 << 60) + material[shape_at + 16 :],
+        "far": material[: shape_at - 8] + struct.pack("<Q", len(material)) + material[shape_at:],
+        "type": material[: shape_at - 9] + b"\x63" + material[shape_at - 8 :],
+        "axes": material[: shape_at - 11] + b"\xff\xff" + material[shape_at - 9 :],
+    }  # fmt: skip
+    for label, data in materials.items():
+        yield from scenes(
+            "measured",
+            {label: '<bsdf type="measured"><string name="filename" value="a.bsdf"/></bsdf>'},
+            "measured material",
+            **{"a.bsdf": data},
+        )

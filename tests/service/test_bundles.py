@@ -14,12 +14,14 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.app import bundle_store, create_app
+from service.bundle_assets import check_asset
 from service.bundles import BundleStore, slug_of
 from service.config import ServiceConfig
 from service.errors import BundleStorageError, UnknownBundleError, UnknownSceneError
 from service.routes_bundles import add_bundle_routes
 from service.scene_sources import BUILTIN_NAMES, SceneSources
 from tests.service.bundle_packing import GLTF, PLY, TRIANGLE, YAML, glb, info_of, pack, pack_infos, png, xml
+from tests.workers.plugin_scenes import write_plugin_scene
 
 ZIP = {"Content-Type": "application/zip"}
 TEXTURED = '<texture type="bitmap" id="t"><string name="filename" value="textures/a b.png"/></texture>'
@@ -351,3 +353,13 @@ def test_the_loader_builds_what_is_accepted(config: ServiceConfig, tmp_path: Pat
     scene = load_scene(store.scene_file(bundle.id), width=8, height=8)
     assert scene.name == ("a" if name == "obj" else "hall")
     shutil.rmtree(config.bundles_path)
+
+
+@pytest.mark.parametrize(
+    ("plugin", "file"),
+    [("measured", "material.bsdf"), ("serialized", "mesh.serialized"), ("ply", "mesh.ply"), ("gridvolume", "six.vol"),
+     ("ellipsoidsmesh", "ellipsoid.ply"), ("envmap", "sky.exr"), ("bitmap", "picture.png")],
+)  # fmt: skip
+def test_files_that_mitsuba_reads_are_accepted(tmp_path: Path, plugin: str, file: str) -> None:
+    write_plugin_scene(tmp_path, "bsdf", "measured")
+    check_asset(plugin, tmp_path / file, "here")

@@ -20,7 +20,9 @@ from workers.renderer import FrameRenderer, renderable_scenes
 from workers.run_state import RunState
 from workers.scene import load_scene
 from workers.settings import Settings
-from workers.train import Trainer, load_dataset, train_ref
+from workers.train import train_ref
+from workers.trainer import Trainer
+from workers.training_data import load_dataset
 
 SIZE = 64
 CAMERA = {"look_at": {"origin": [0.0, 1.0, 2.4], "target": [0.0, 0.7, 0.0], "up": [0, 1, 0]}}

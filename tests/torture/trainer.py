@@ -23,7 +23,9 @@ def train(store_url: str, log: Path, settings: dict[str, object]) -> None:
     from workers.loaded_run import open_run
     from workers.progress import Progress
     from workers.render import render_ref
-    from workers.train import Trainer, load_dataset, train_ref
+    from workers.train import train_ref
+    from workers.trainer import Trainer
+    from workers.training_data import load_dataset
 
     loaded = open_run(tiny_spec(**settings, **{"train.epochs": EPOCHS}), store_url, Progress())
     run, spp = loaded.run, loaded.run.settings.frames.train_spp

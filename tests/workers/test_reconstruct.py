@@ -6,8 +6,9 @@ import torch
 
 from models.network import FusionNet, NetworkConfig
 from models.transfer import Transfer
+from workers import reconstruct
 from workers.query import CHANNELS, NUM_CHANNELS
-from workers.reconstruct import GBUFFER_CHANNELS, Encoding, Reconstructor, pad_to_multiple
+from workers.reconstruct import GBUFFER_CHANNELS, MAX_COMPILED, MAX_SIZES, Encoding, Reconstructor, pad_to_multiple
 
 CONFIG = NetworkConfig(gbuffer_channels=GBUFFER_CHANNELS, widths=(16, 16, 16), unshuffle=2, residual=True)
 ENCODING = Encoding(exposure=0.5, distance_scale=4.0, transfer=Transfer())
@@ -60,3 +61,46 @@ def test_non_finite_input_is_not_hidden(features: np.ndarray) -> None:
     features[4, 4, 0] = np.nan
     frame = Reconstructor(FusionNet(CONFIG), ENCODING, precision="fp32")(features)
     assert not np.isfinite(frame).all()
+
+
+def frame_of(height: int, width: int) -> np.ndarray:
+    return np.random.default_rng(7).random((height, width, NUM_CHANNELS)).astype(np.float32)
+
+
+def test_sizes_are_remembered_up_to_a_bound_and_the_oldest_is_measured_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    reconstructor = Reconstructor(FusionNet(CONFIG), ENCODING, precision="fp32")
+    measured: list[tuple[int, ...]] = []
+    choose = reconstructor._choose
+
+    def counted(features: torch.Tensor) -> object:
+        measured.append(tuple(features.shape[:2]))
+        return choose(features)
+
+    monkeypatch.setattr(reconstructor, "_choose", counted)
+    sizes = [(8 + i, 8) for i in range(MAX_SIZES)]
+    frames = [reconstructor(frame_of(*size)) for size in sizes]
+    reconstructor(frame_of(*sizes[0]))
+    assert measured == sizes and len(reconstructor.choices) == MAX_SIZES
+    reconstructor(frame_of(8, 40))
+    assert len(reconstructor.choices) == MAX_SIZES and reconstructor.choices["40x8"] == "fp32"
+    assert "8x8" in reconstructor.choices and "8x9" not in reconstructor.choices, "asked for longest ago"
+    np.testing.assert_array_equal(reconstructor(frame_of(*sizes[1])), frames[1])
+    assert measured == [*sizes, (8, 40), sizes[1]]
+
+
+def test_sizes_share_one_copy_in_bf16() -> None:
+    reconstructor = Reconstructor(FusionNet(CONFIG), ENCODING, precision="bf16")
+    for height in (8, 12, 16):
+        reconstructor(frame_of(height, 8))
+    assert set(reconstructor.choices.values()) == {"bf16"}
+    modules = {id(module) for _, module in reconstructor._chosen.values()}
+    assert modules == {id(reconstructor._bf16)}
+
+
+def test_no_more_sizes_are_compiled_than_torch_should_keep(monkeypatch: pytest.MonkeyPatch) -> None:
+    compiled: list[object] = []
+    monkeypatch.setattr(reconstruct, "_try_compile", lambda module, features: compiled.append(features.shape))
+    reconstructor = Reconstructor(FusionNet(CONFIG), ENCODING, precision="fp32", compile=True)
+    for extra in range(MAX_COMPILED + 3):
+        reconstructor(frame_of(8, 8 + extra))
+    assert len(compiled) == len(set(compiled)) == MAX_COMPILED

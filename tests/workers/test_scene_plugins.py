@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.workers.plugin_scenes import OF_ONE_PIXEL, write_plugin_scene
 from workers.errors import SceneError
 from workers.scene import load_scene
 from workers.scene_plugins import ALLOWED_PLUGINS, PLUGINS, REFUSED_PLUGINS, plugin_refusal
@@ -30,37 +31,12 @@ def test_plugin_refusal_tells_why() -> None:
     assert "none of the Mitsuba plugins" in (plugin_refusal("../evil") or "")
 
 
-BODIES = {
-    "bsdf": "<shape type='cube'><bsdf type='{}'/></shape>",
-    "emitter": "<emitter type='{}'/>",
-    "shape": "<shape type='{}'/>",
-    "sampler": "<sensor type='perspective'><sampler type='{}'/></sensor>",
-    "rfilter": "<sensor type='perspective'><film type='hdrfilm'><rfilter type='{}'/></film></sensor>",
-    "integrator": "<integrator type='{}'/>",
-    "medium": "<shape type='cube'><medium type='{}' name='interior'/></shape>",
-}
-WITHOUT_VALUES = {  # those that need none
-    "bsdf": "circular conductor dielectric diffuse hair null plastic polarizer pplastic principled principledthin "
-    "retarder roughconductor roughdielectric roughplastic thindielectric",
-    "emitter": "constant directional point spot sunsky timed_sunsky",
-    "shape": "cube cylinder disk rectangle sphere",
-    "sampler": " ".join(sorted(PLUGINS["sampler"])),
-    "rfilter": " ".join(sorted(PLUGINS["rfilter"])),
-    "integrator": "depth direct moment path prb ptracer volpath volpathmis",
-    "medium": " ".join(sorted(PLUGINS["medium"])),
-}
-CASES = [(kind, name) for kind, names in WITHOUT_VALUES.items() for name in names.split()]
-
-
-@pytest.mark.parametrize(("kind", "name"), CASES)
-def test_the_loader_builds_allowed_plugins(tmp_path: Path, kind: str, name: str) -> None:
-    body = BODIES[kind].format(name)
-    sensor = "" if "<sensor" in body else "<sensor type='perspective'/>"
-    light = "<emitter type='point'/>" if kind != "emitter" else ""
-    scene = tmp_path / "scene.xml"
-    scene.write_text(f"<scene version='3.0.0'>{sensor}{light}<shape type='rectangle'/>{body}</scene>")
-    assert name in ALLOWED_PLUGINS
-    load_scene(scene, width=8, height=8)
+@pytest.mark.parametrize(("tag", "name"), [(tag, name) for tag in PLUGINS for name in sorted(PLUGINS[tag])])
+def test_the_loader_builds_every_allowed_plugin(tmp_path: Path, tag: str, name: str) -> None:
+    path = write_plugin_scene(tmp_path, tag, name)
+    assert f"type='{name}'" in path.read_text()
+    edge_px = 1 if name in OF_ONE_PIXEL else 8
+    load_scene(path, width=edge_px, height=edge_px)
 
 
 @pytest.mark.parametrize("name", ["instance", "shapegroup", "specfilm", "stokes"])

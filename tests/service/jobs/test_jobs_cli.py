@@ -18,7 +18,7 @@ from service.jobs.service import Jobs
 from service.jobs.submission import Desk
 from service.jobs_client import JobsClient, StreamEvent, parse_events
 from service.jobs_watch import watch
-from service.scene_names import resolve_builtin_scene
+from service.scene_sources import SceneSources
 from workers.scene_request import SceneRequest
 
 Make = Callable[..., Any]
@@ -27,7 +27,7 @@ Make = Callable[..., Any]
 @pytest.fixture
 def url(tmp_path: Path, runner: Any, backend: Any, serve_app: Make, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     wish = SceneRequest(name="tiny", width=8, height=8)
-    desk = Desk(resolve_scene_source=resolve_builtin_scene, read_scene=lambda _: wish)
+    desk = Desk(resolve_scene_source=SceneSources().resolve_scene_source, read_scene=lambda _: wish)
     options = {"poll_s": 0.02}
     jobs = Jobs(f"sqlite:///{tmp_path / 'jobs.sqlite'}", runner, desk, dispatcher_options=options)
     with serve_app(create_app("unused", make_backend=lambda: backend, jobs=jobs)) as address:
@@ -87,7 +87,7 @@ def test_jobs_are_steered_and_listed(url: str, runner: Any, wait_until: Make) ->
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("submit", "attic"), r"the service refused (404): scene must be one that this service has"),
+        (("submit", "attic"), "the service refused (404): scene must be one of tabletop, tiny"),
         (("submit", "tiny", "--set", "cache.colour=1"), "cache.colour"),
         (("submit", "tiny", "--until", "paint"), "--until must be one of"),
         (("show", "0123"), "(404): job must be one"),

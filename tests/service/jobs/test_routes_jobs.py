@@ -14,13 +14,12 @@ import httpx
 import pytest
 
 from service.app import create_app
-from service.errors import UnknownSceneError
 from service.jobs.planner import MAX_WAITING, Planner
 from service.jobs.run import REPORT
 from service.jobs.service import Jobs
 from service.jobs.submission import Desk
 from service.jobs_client import StreamEvent, parse_events
-from service.scene_names import resolve_builtin_scene
+from service.scene_sources import SceneSources
 from workers.errors import SceneError
 from workers.scene_request import SceneRequest
 
@@ -29,7 +28,7 @@ BODY = {"scene": "tiny", "preset": "tiny"}
 
 
 def resolve(name: str) -> str:
-    return name if name == "broken.xml" else resolve_builtin_scene(name)
+    return name if name == "broken.xml" else SceneSources().resolve_scene_source(name)
 
 
 def read_scene(source: str) -> SceneRequest:
@@ -105,7 +104,7 @@ def test_a_job_gets_the_scenes_wishes_and_the_clients_win(client: httpx.Client, 
     settings = jobs.table.get(job_id).spec["settings"]
     assert (settings["width"], settings["height"], settings["cache"]["azimuth"]) == (48, 32, 6)
     assert settings["cache"]["polar"] == 7 and settings["train"]["widths"] == [8, 8, 8]
-    assert jobs.table.get(job_id).spec["scene"] == "builtin:tiny"
+    assert jobs.table.get(job_id).spec["scene"] == "tiny"
 
 
 @pytest.mark.parametrize(
@@ -116,7 +115,7 @@ def test_a_job_gets_the_scenes_wishes_and_the_clients_win(client: httpx.Client, 
         ({"preset": "best"}, 422, "preset must be one of draft"),
         ({"settings": {"cache.colour": 1}}, 422, "cache.colour"),
         ({"settings": {"frames.train_spp": "many"}}, 422, "frames.train_spp"),
-        ({"settings": {"frames.train_spp": 0}}, 422, "must be above 0"),
+        ({"settings": {"frames.train_spp": 0}}, 422, "must be 1 to 16,777,216"),
         ({"settings": {"preset": "draft"}}, 422, "beside settings"),
         ({"settings": {"width": 4000}}, 422, "at most 100000 pixels, got 4000x32"),
         ({"settings": {"frames.test_spp": 5001}}, 422, "at most 5000 paths"),
@@ -248,7 +247,7 @@ def test_a_preview_before_any_pass_is_409(client: httpx.Client, runner: Any) -> 
 def test_a_plan_says_what_a_job_would_do_and_makes_none(client: httpx.Client, jobs: Jobs) -> None:
     answer = client.post("/v1/plan", json=BODY)
     assert answer.status_code == 200, answer.text
-    assert answer.json()["rows"] == [{"item": "size", "choice": "48x32", "reason": "builtin:tiny"}]
+    assert answer.json()["rows"] == [{"item": "size", "choice": "48x32", "reason": "tiny"}]
     assert answer.json()["cost"]["paths"] == 10 and jobs.table.page() == []
     assert_problem(client.post("/v1/plan", json={**BODY, "preset": "best"}), 422, "preset must be one of")
 
@@ -307,9 +306,3 @@ def test_openapi_has_examples_and_problems(client: httpx.Client) -> None:
     schemas = document["components"]["schemas"]
     assert schemas["JobRequest"]["examples"] and schemas["JobView"]["examples"]
     assert "HTTPValidationError" not in json.dumps(document["paths"]["/v1/jobs"])
-
-
-def test_builtin_scenes_are_resolved_and_others_are_not() -> None:
-    assert resolve_builtin_scene("tabletop") == "builtin:tabletop"
-    with pytest.raises(UnknownSceneError):
-        resolve_builtin_scene("/etc/passwd")
