@@ -159,12 +159,13 @@ def run_stages(stages: tuple[str, ...], scene: "Scene", store: Store, settings: 
     from workers.element_stage import run_elements
     from workers.inputs import run_inputs
     from workers.pipeline import RENDER_STAGES
+    from workers.plan_stage import planned_run
     from workers.query import QueryProgram
     from workers.render import run_render
     from workers.run_state import RunState
     from workers.train import run_train
 
-    run = RunState(scene, store, settings, progress)
+    run = planned_run(RunState(scene, store, settings, progress))
     if scene.digest not in {entry["digest"] for entry in store.scenes()}:
         store.register_scene(scene.digest, {"name": scene.name, "source": str(scene.source)})
     elements = run_elements(run)

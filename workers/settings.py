@@ -152,6 +152,22 @@ class EvaluationSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PlanSettings:
+    """Who decides what a scene requires (`workers/planner.py`).
+
+    Attributes:
+        mode: "preset" (the preset's numbers as they are), "adaptive" (a plan of the scene replaces them before the
+            first stage) or "applied" (it has).
+        noise: relative standard error of each lobe over the frame, after the caches' filter, that the plan aims at.
+        keep: settings that the plan must leave as they are, by dotted key.
+    """
+
+    mode: Literal["preset", "adaptive", "applied"] = "preset"
+    noise: float = 0.04
+    keep: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
 class Settings:
     """All settings of a run."""
 
@@ -163,6 +179,7 @@ class Settings:
     frames: FrameSettings = field(default_factory=FrameSettings)
     train: TrainSettings = field(default_factory=TrainSettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
+    plan: PlanSettings = field(default_factory=PlanSettings)
 
     @classmethod
     def preset_named(cls, name: str) -> "Settings":
@@ -186,6 +203,16 @@ class Settings:
             result = _set(result, key.split("."), value, key)
         _check(result)
         return result
+
+    def choose(self, values: dict[str, Any]) -> Self:
+        """`override` by a person: a plan leaves these settings as they are.
+
+        Raises:
+            SettingsError: as `override`.
+        """
+        chosen = self.override(values)
+        keep = {*chosen.plan.keep, *(key for key in values if "." in key and not key.startswith("plan."))}
+        return chosen.override({"plan.keep": tuple(sorted(keep))})
 
     def to_json(self) -> dict[str, Any]:
         """Plain nested dict."""
@@ -216,13 +243,13 @@ _PRESETS: dict[str, dict[str, Any]] = {
     "balanced": {
         "cache.max_elements": 150_000, "cache.diffuse_spp": 4096, "cache.directional_spp": 16,
         "frames.num_train": 72, "frames.num_validation": 8, "frames.num_test": 12, "frames.train_spp": 256,
-        "frames.test_spp": 4096, "train.seconds": 3600.0, "train.epochs": 1000,
+        "frames.test_spp": 4096, "train.seconds": 3600.0, "train.epochs": 1000, "plan.noise": 0.03,
     },
     "reference": {
         "cache.max_elements": 400_000, "cache.diffuse_spp": 16_384, "cache.azimuth": 64, "cache.polar": 16,
         "cache.directional_spp": 32, "frames.num_train": 90, "frames.num_validation": 10, "frames.num_test": 200,
         "frames.train_spp": 4000, "frames.denoise_train": False, "frames.test_spp": 4000,
-        "train.seconds": 0.0, "train.epochs": 1000, "train.widths": (48, 64, 96),
+        "train.seconds": 0.0, "train.epochs": 1000, "train.widths": (48, 64, 96), "plan.noise": 0.015,
     },
     "demo": {
         "width": 256, "height": 256, "cache.max_elements": 40_000, "cache.diffuse_spp": 512,
@@ -291,7 +318,7 @@ _POSITIVE = (
     "cache.azimuth", "cache.polar", "cache.directional_spp", "cache.passes", "cache.elements_per_unit",
     "frames.num_train", "frames.num_validation", "frames.num_test", "frames.train_spp", "frames.test_spp",
     "frames.passes", "train.batch", "train.crop", "train.perceptual_every", "train.epochs", "train.learning_rate",
-    "evaluation.timing_repeats",
+    "evaluation.timing_repeats", "plan.noise",
 )  # fmt: skip
 
 
