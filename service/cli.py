@@ -114,8 +114,8 @@ def plan(
         outputs = Outputs(json=json_file)
         loaded = _load(scene, resolution)
         settings = _settings(preset, loaded, assignments)
-        from service.options import write_file
         from service.benchmarks import json_bytes
+        from service.options import write_file
         from service.table import plan_table, show
         from workers.pipeline import plan_scene
 

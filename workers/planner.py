@@ -1,8 +1,8 @@
 """What a scene requires: decisions from its audit and a pilot bake, each with its reason.
 
-A plan never changes where caches sit (elements follow from the scene, its cameras and the budget), so that it can be made
-from the elements themselves. It lowers what is not needed and moves paths to the lobe that is noisier, but never asks for
-more than `CEILING` times the given paths of a lobe.
+A plan never changes where caches sit (elements follow from the scene, its cameras and the budget), so that it can be
+made from the elements themselves. It lowers what is not needed and moves paths to the lobe that is noisier, but never
+asks for more than `CEILING` times the given paths of a lobe.
 """
 
 import math
