@@ -88,9 +88,9 @@ class SceneAudit:
     channels: dict[str, ChannelSpread | None]
     moving: tuple[str, ...] = ()
 
-    def share(self, kind: str) -> float:
-        """Visibility of all materials of a kind ("glossy", "delta", ...)."""
-        return sum(material.visibility for material in self.materials if kind in material.facts.kinds)
+    def share(self, *kinds: str) -> float:
+        """Visibility of all materials of any of some kinds ("glossy", "delta", ...)."""
+        return sum(material.visibility for material in self.materials if set(kinds) & set(material.facts.kinds))
 
     def to_json(self) -> dict[str, Any]:
         """Plain nested values."""

@@ -152,7 +152,9 @@ def _stated_alpha(parameters: Mapping[str, Any]) -> tuple[np.ndarray, bool]:
         name = next((part for part in parts if part in ALPHA_NAMES), None)
         if name is None or parts[-1] in _NOT_A_VALUE:
             continue
-        numbers = np.array(parameters[key], np.float64).reshape(-1)
+        stored = np.array(parameters[key]).reshape(-1)
+        whole = np.issubdtype(stored.dtype, np.integer)  # texels that are kept as they lie in the file
+        numbers = stored.astype(np.float64) / (np.iinfo(stored.dtype).max if whole else 1)
         from_texture |= len(numbers) > 1 or parts[-1] == "data" or bool(set(_COLOURS) & set(parts))
         found.append(np.square(numbers) if name == "roughness" else numbers)
     return (np.concatenate(found) if found else np.zeros(0)), from_texture

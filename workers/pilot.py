@@ -162,8 +162,8 @@ class _PilotBake:
 
     def _stratum(self, chosen: np.ndarray, share: float, *, directional: bool) -> _Stratum:
         rho, tint = self._colours(chosen, directional=directional)
-        variance, step, specular = np.zeros(rho.shape[:2]), np.zeros(rho.shape[:2]), np.zeros(rho.shape[:2])
-        shown = np.zeros(rho.shape[:2])
+        nothing: np.ndarray = np.zeros(rho.shape[:2])
+        variance = step = specular = shown = nothing
         if not self.exitant:
             neighbour = self._neighbours(chosen)
             mean, error = self._diffuse(np.concatenate([chosen, neighbour]))

@@ -23,6 +23,7 @@ from workers.pathtrace import flush, trace
 from workers.pilot import Pilot
 from workers.plan import StageCost
 from workers.query import CHANNELS
+from workers.reconstruct import channels_last
 from workers.run_state import RunState
 from workers.settings import Settings
 
@@ -167,7 +168,7 @@ def step_seconds(settings: Settings) -> float:
         gbuffer_channels=CHANNELS["distance"][1] - CHANNELS["normal"][0], widths=train.widths,  # type: ignore[arg-type]
         fusion=train.fusion, unshuffle=train.unshuffle, residual=train.residual,
     )  # fmt: skip
-    network = FusionNet(config).to(memory_format=torch.channels_last)
+    network = channels_last(FusionNet(config))
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-4)
     losses = _losses(settings)
     generator = torch.Generator().manual_seed(0)

@@ -145,17 +145,17 @@ class _Planner:
             before = f"{100 * noise.standard_error(preset, pooled):.2g} % with {preset} as given"
             reason = f"pilot: {left:.2g} % relative noise (goal {100 * target:.2g} %), {before}"
             if wanted > highest:
-                reason += f"; the goal asks for {wanted:.0f}, at most {CEILING} times the preset's are given"
+                reason += f"; the goal asks for {wanted:.3g}, at most {CEILING} times the preset's are given"
             elif spp > wanted and spp == lowest:
                 reason += f"; no fewer than {lowest}"
             key = f"cache.{lobe}_spp"
-            self._choose(f"{lobe} lobe", {key: spp}, lambda v, key=key, unit=unit: f"{v[key]} {unit}", reason)
+            self._choose(f"{lobe} lobe", {key: spp}, _shows(key, unit), reason)
 
     def _choose_network(self) -> bool:
         predicted, widths = self._predicted_db(), self.settings.train.widths
-        directional = self.elements.share_directional + self.audit.share("delta")
+        directional = self.audit.share("glossy", "delta")
         shown = "beyond measure" if math.isinf(predicted) else f"{predicted:.1f} dB"
-        if directional == 0 and predicted >= NO_NETWORK_DB:
+        if directional == 0 and predicted >= NO_NETWORK_DB and self.settings.cache.lobes == "split":
             reason = (
                 f"purely diffuse, and the caches alone are predicted at {shown} (bound {NO_NETWORK_DB:.0f} dB): "
                 "the frame needs no network; a run trains the smallest"
@@ -271,3 +271,7 @@ def grid_for(alpha: float) -> tuple[int, int]:
 
 def _by(grid: tuple[int, int]) -> str:
     return f"{grid[0]}x{grid[1]}"
+
+
+def _shows(key: str, unit: str) -> Callable[[dict[str, Any]], str]:
+    return lambda values: f"{values[key]} {unit}"
