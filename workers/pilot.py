@@ -246,8 +246,9 @@ class _PilotBake:
         bright = _weighted_quantile(shown, share, 0.8)
         if bright <= 0:
             bright = float(shown.max(initial=0.0))
-        floored = np.maximum(shown, max(FLOOR * bright, np.finfo(np.float64).tiny))
-        weight = share * np.minimum(shown / max(bright, np.finfo(np.float64).tiny), 1.0) ** (2 / DISPLAY_GAMMA)
+        bright = bright if bright > 0 else 1.0  # a black scene: nothing is shown of any lobe
+        floored = np.maximum(shown, FLOOR * bright)
+        weight = share * np.minimum(shown / bright, 1.0) ** (2 / DISPLAY_GAMMA)
         power = float(weight.sum())
 
         def over_frame(name: str, *, robust: bool) -> float:

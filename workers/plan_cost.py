@@ -29,8 +29,9 @@ from workers.settings import Settings
 
 CALIBRATION_PATHS = 1 << 19
 CALIBRATION_EDGE_PX = 256
-MARKER_NBYTES = 900  # of a bake unit: its record and the file's place in the set
-SET_NBYTES = 3500  # metadata of a cache set and its marker
+# Records beside the values: JSON of each bake unit and of the set, a part of it for every array.
+UNIT_NBYTES, UNIT_ARRAY_NBYTES = 582, 210
+SET_NBYTES, SET_ARRAY_NBYTES = 1015, 915
 VALUE_NBYTES = 4
 
 
@@ -107,7 +108,7 @@ def stage_costs(settings: Settings, elements: ElementSet, rates: Rates, pilot: P
         if rows:
             per_pass = -(-spp // cache.passes)
             paths = rows * directions * per_pass * cache.passes
-            nbytes = cache_nbytes(rows, directions * 3 * arrays, cache.elements_per_unit, pilot.samples.get(lobe, []))
+            nbytes = cache_nbytes(rows, directions * 3, arrays, cache.elements_per_unit, pilot.samples.get(lobe, []))
             costs.append(StageCost(stage=f"bake {lobe}", paths=paths, seconds=paths / rate, nbytes=nbytes,
                                    note=_rate_note(paths, rate)))  # fmt: skip
     for name, count, spp in (("training frames", frames.num_train, frames.train_spp),
@@ -124,11 +125,14 @@ def _rate_note(paths: int, rate: float) -> str:
     return f"{paths / 1e6:.3g} M paths at {rate / 1e6:.2f} M/s"
 
 
-def cache_nbytes(rows: int, values_per_row: int, rows_per_unit: int, samples: list[np.ndarray]) -> int:
+def cache_nbytes(
+    rows: int, values_per_row: int, arrays: int, rows_per_unit: int, samples: list[np.ndarray]
+) -> int:  # fmt: skip
     """Bytes of a cache set at rest: its values, compressed as well as the pilot's, and its records."""
-    raw = rows * values_per_row * VALUE_NBYTES
+    raw = rows * values_per_row * arrays * VALUE_NBYTES
     units = -(-rows // rows_per_unit)
-    return int(raw * compressed_share(samples)) + units * MARKER_NBYTES + SET_NBYTES
+    records = units * (UNIT_NBYTES + UNIT_ARRAY_NBYTES * arrays) + SET_NBYTES + SET_ARRAY_NBYTES * arrays
+    return int(raw * compressed_share(samples)) + records
 
 
 def compressed_share(samples: list[np.ndarray]) -> float:

@@ -118,7 +118,7 @@ class _Planner:
             return
         alpha = sharpest_alpha(self.audit)
         wanted = grid_for(alpha)
-        grid = wanted if wanted[1] <= preset[1] else preset
+        grid = wanted if math.prod(wanted) <= math.prod(preset) else preset
         reason = (
             f"{100 * (1 - GRID_QUANTILE):.0f} % of the visible glossy surface is rougher than alpha {alpha:.2g}, "
             f"whose highlight asks for {_by(wanted)}" + ("; the preset's grid is the limit" if grid != wanted else "")
