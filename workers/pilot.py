@@ -242,7 +242,7 @@ class _PilotBake:
 
     def _summed_up(self, strata: list[_Stratum], num_directional: int) -> Pilot:
         share = np.concatenate([np.full(s.shown.size, s.share / s.shown.size) for s in strata])
-        shown = np.concatenate([s.shown.reshape(-1) for s in strata])
+        shown = np.maximum(np.concatenate([s.shown.reshape(-1) for s in strata]), 0.0)
         bright = _weighted_quantile(shown, share, 0.8)
         if bright <= 0:
             bright = float(shown.max(initial=0.0))
