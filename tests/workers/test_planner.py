@@ -10,20 +10,51 @@ import pytest
 from storage.caches import CacheSet
 from storage.store import Store
 from tests.workers.planned_scenes import SKY, open_run, scene_file
-from workers.audit import SceneAudit
+from workers.audit import SceneAudit, audit_scene
 from workers.bake import bake_refs, run_bake
+from workers.camera_path import domain_poses
 from workers.element_stage import run_elements
+from workers.plan import Choice
 from workers.plan_cost import Rates, compressed_share, stage_costs
 from workers.plan_stage import FILE, plan_ref, planned_run
-from workers.planner import GRIDS, decide, grid_for, sharpest_alpha
+from workers.planner import GRIDS, Decision, _Planner, decide, grid_for, sharpest_alpha
+from workers.run_state import PATH_SEED, RunState
+from workers.scene import load_scene
 from workers.settings import Settings, SettingsError
 
 ROUGH = {"type": "roughconductor", "alpha": 0.5}
 RATES = Rates(elements_s=1.0, diffuse=1e6, directional=1e6, frames=1e6, step_s={(16, 16, 16): 0.1})
 
 
-def choice(decision: Any, item: str) -> Any:
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Decision:
+    """A grey floor under a white sky."""
+    return decide(open_run(scene_file(tmp_path_factory.mktemp("plain"), light=SKY)))
+
+
+@pytest.fixture(scope="module")
+def rough_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The floor with a rough metal ball."""
+    return scene_file(tmp_path_factory.mktemp("rough"), ROUGH, light=SKY)
+
+
+@pytest.fixture(scope="module")
+def rough(rough_file: Path) -> Decision:
+    return decide(open_run(rough_file))
+
+
+def choice(decision: Decision, item: str) -> Choice:
     return next(each for each in decision.choices if each.item == item)
+
+
+def decided_again(decision: Decision, settings: Settings) -> Decision:
+    """From the same audit and pilot with other settings."""
+    parts = (decision.audit, decision.elements, decision.pilot, decision.element_set)
+    return _Planner(settings, *parts).decision()
+
+
+def small(**chosen: Any) -> Settings:
+    return Settings.preset_named("tiny").override({"cache.max_elements": 300}).choose(chosen)
 
 
 def test_choosing_remembers_what_a_person_set() -> None:
@@ -40,43 +71,46 @@ def test_grid_follows_roughness() -> None:
         GRIDS[0], GRIDS[0], GRIDS[1], GRIDS[2], GRIDS[2]]  # fmt: skip
 
 
-def test_scene_without_glossy_materials_has_no_directions(tmp_path: Path) -> None:
-    decision = decide(open_run(scene_file(tmp_path, light=SKY)))
-    assert choice(decision, "directions").choice == choice(decision, "directional lobe").choice == "none"
-    assert "cache.directional_spp" not in decision.overrides
-    assert not decision.network_needed and "not needed" in choice(decision, "network").choice
+def test_scene_without_glossy_materials_has_no_directions(plain: Decision) -> None:
+    assert choice(plain, "directions").choice == choice(plain, "directional lobe").choice == "none"
+    assert "cache.directional_spp" not in plain.overrides
+    assert not plain.network_needed and "not needed" in choice(plain, "network").choice
+    wide = decided_again(plain, small().override({"train.widths": (32, 48, 64)}))
+    assert wide.overrides["train.widths"] == (16, 16, 16)
+    paper = decided_again(plain, small(**{"cache.lobes": "exitant"}))
+    assert paper.network_needed, "the paper's caches are never enough"
 
 
-def test_glossy_and_glass_balls_need_a_network(tmp_path: Path) -> None:
-    for ball in (ROUGH, {"type": "dielectric"}):
-        assert decide(open_run(scene_file(tmp_path, ball, light=SKY))).network_needed
+def test_glossy_and_glass_balls_need_a_network(rough: Decision, tmp_path: Path) -> None:
+    glass = decide(open_run(scene_file(tmp_path, {"type": "dielectric"}, light=SKY)))
+    assert rough.network_needed and glass.network_needed
+    assert choice(glass, "delta surfaces").choice.startswith("followed")
 
 
-def test_plan_repeats_itself_and_a_persons_setting_stays(tmp_path: Path) -> None:
-    path = scene_file(tmp_path, ROUGH, light=SKY)
-    free, again = (decide(open_run(path)) for _ in range(2))
-    assert (free.overrides, free.choices) == (again.overrides, again.choices)
-    assert "cache.directional_spp" in free.overrides, "else the next lines show nothing"
-    kept = decide(open_run(path, **{"cache.directional_spp": 4}))
+def test_plan_repeats_itself(rough: Decision, rough_file: Path) -> None:
+    again = decide(open_run(rough_file))
+    assert (rough.overrides, rough.choices) == (again.overrides, again.choices)
+
+
+def test_a_persons_setting_stays_and_the_plan_says_so(rough: Decision) -> None:
+    assert "cache.directional_spp" in rough.overrides, "else the next lines show nothing"
+    kept = decided_again(rough, small(**{"cache.directional_spp": 4}))
     assert "cache.directional_spp" not in kept.overrides
     said = choice(kept, "directional lobe")
     assert said.by == "you" and said.choice.startswith("4 ") and "set by you" in said.reason
-    assert choice(free, "directional lobe").by == "plan"
+    assert choice(rough, "directional lobe").by == "plan"
 
 
-def test_lower_goal_asks_for_more_paths_and_stays_within_twice_the_given(tmp_path: Path) -> None:
-    path = scene_file(tmp_path, ROUGH, light=SKY)
-    spp = [
-        decide(open_run(path, **{"plan.noise": goal})).overrides.get("cache.directional_spp", 4)
-        for goal in (0.5, 1e-4)
-    ]  # fmt: skip
-    assert spp == [1, 8]
+def test_lower_goal_asks_for_more_paths_and_stays_within_twice_the_given(rough: Decision) -> None:
+    plans = [decided_again(rough, small(**{"plan.noise": goal})) for goal in (0.5, 1e-4)]
+    assert [plan.overrides.get("cache.directional_spp", 4) for plan in plans] == [1, 8]
 
 
 def test_textured_roughness_counts_with_its_sharpest_texel(tmp_path: Path) -> None:
     alpha = {"type": "checkerboard", "color0": 0.05, "color1": 0.5}
-    decision = decide(open_run(scene_file(tmp_path, {"type": "roughconductor", "alpha": alpha}, light=SKY)))
-    assert sharpest_alpha(decision.audit) == pytest.approx(0.05)
+    run = open_run(scene_file(tmp_path, {"type": "roughconductor", "alpha": alpha}, light=SKY))
+    audit = audit_scene(run.scene.mi_scene, run.table, domain_poses(run.paths, 2, PATH_SEED), 2304)
+    assert sharpest_alpha(audit) == pytest.approx(0.05)
 
 
 def test_no_visible_material_is_as_rough_as_can_be() -> None:
@@ -84,9 +118,11 @@ def test_no_visible_material_is_as_rough_as_can_be() -> None:
     assert sharpest_alpha(nothing) == 1.0
 
 
-def test_planned_run_is_stored_read_again_and_marked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_planned_run_is_stored_read_again_and_marked(
+    rough_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     store = Store.open(str(tmp_path / "store"), create=True)
-    run = open_run(scene_file(tmp_path, ROUGH, light=SKY), store, **{"plan.mode": "adaptive"})
+    run = open_run(rough_file, store, **{"plan.mode": "adaptive"})
     planned = planned_run(run)
     assert planned.settings.plan.mode == "applied" and planned_run(planned) is planned
     kept = json.loads(store.read(plan_ref(run), FILE))
@@ -96,13 +132,14 @@ def test_planned_run_is_stored_read_again_and_marked(tmp_path: Path, monkeypatch
         assert planned.settings.to_json()[section][name] == value
     monkeypatch.setattr("workers.plan_stage.decide", None)  # a second plan would fail
     assert planned_run(run).settings == planned.settings
-    preset = open_run(scene_file(tmp_path, ROUGH, light=SKY), store)
+    preset = open_run(rough_file, store)
     assert planned_run(preset) is preset
 
 
 def test_predicted_paths_and_bytes_are_those_of_the_bake(tmp_path: Path) -> None:
     store = Store.open(str(tmp_path / "store"), create=True)
-    run = open_run(scene_file(tmp_path, ROUGH, light=SKY), store)
+    scene = load_scene("tiny", width=64, height=64)
+    run = RunState(scene, store, Settings.preset_named("tiny"))
     decision = decide(run)
     costs = {cost.stage: cost for cost in stage_costs(run.settings, decision.element_set, RATES, decision.pilot)}
     elements = run_elements(run)
@@ -115,13 +152,10 @@ def test_predicted_paths_and_bytes_are_those_of_the_bake(tmp_path: Path) -> None
         assert costs[f"bake {lobe}"].nbytes == pytest.approx(CacheSet.open(store, ref).nbytes, rel=0.1), lobe
 
 
-def test_time_of_training_is_limited_by_its_budget(tmp_path: Path) -> None:
-    decision = decide(open_run(scene_file(tmp_path, light=SKY)))
-    settings = Settings.preset_named("tiny")
-
+def test_time_of_training_is_limited_by_its_budget(plain: Decision) -> None:
     def seconds(**overrides: Any) -> float:
-        given = settings.override(overrides)
-        return stage_costs(given, decision.element_set, RATES, decision.pilot)[-1].seconds
+        given = Settings.preset_named("tiny").override(overrides)
+        return stage_costs(given, plain.element_set, RATES, plain.pilot)[-1].seconds
 
     # 4 frames of 64 x 64 in crops of 32: 16 crops, 8 steps of 2, 3 epochs.
     assert seconds() == pytest.approx(24 * 0.1)
