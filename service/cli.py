@@ -62,7 +62,7 @@ def _settings(preset: str, scene: "Scene", assignments: list[str] | None) -> "Se
 
     size = {"width": scene.camera.width, "height": scene.camera.height}
     overrides = parse_overrides(assignments or [])
-    return Settings.preset_named(preset).override({**size, **scene.settings, **overrides})
+    return Settings.preset_named(preset).choose({**size, **scene.settings, **overrides})
 
 
 def _run(scene: "Scene", store_url: str, settings: "Settings", outputs: Outputs) -> None:
@@ -105,15 +105,25 @@ def plan(
     preset: PresetOption = "balanced",
     resolution: ResolutionOption = None,
     assignments: SetOption = None,
+    json_file: JsonOption = None,
 ) -> None:
-    """Show what a run would do for this scene, why, and what it costs. Computes nothing."""
+    """Show what a scene requires, why, and what a run costs, from an audit and a pilot bake of seconds.
+
+    `lightwell run SCENE --planned` takes the choices; what --set gives is left as it is.
+    """
     with reported():
+        outputs = Outputs(json=json_file)
         loaded = _load(scene, resolution)
         settings = _settings(preset, loaded, assignments)
+        from service.benchmarks import json_bytes
+        from service.options import write_file
         from service.table import plan_table, show
         from workers.pipeline import plan_scene
 
-        show(plan_table(plan_scene(loaded, settings)))
+        made = plan_scene(loaded, settings)
+        show(plan_table(made))
+        if outputs.json is not None:
+            write_file(outputs.json, json_bytes(made))
 
 
 @app.command()
@@ -126,12 +136,18 @@ def run(
     json_file: JsonOption = None,
     report: ReportOption = None,
     picture: PictureOption = None,
+    planned: Annotated[
+        bool, typer.Option("--planned", help="let a plan of the scene replace the preset's numbers; see plan")
+    ] = False,
 ) -> None:
     """Bake, render, train and evaluate. Started again, it goes on where it stopped."""
     with reported():
         outputs = Outputs(json=json_file, report=report, picture=picture)
         loaded = _load(scene, resolution)
-        _run(loaded, store, _settings(preset, loaded, assignments), outputs)
+        settings = _settings(preset, loaded, assignments)
+        if planned:
+            settings = settings.override({"plan.mode": "adaptive"})
+        _run(loaded, store, settings, outputs)
 
 
 @app.command()

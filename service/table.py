@@ -60,19 +60,24 @@ def plan_table(plan: Mapping[str, Any]) -> RenderableType:
     """A plan's choices with their reasons, and what they cost.
 
     Args:
-        plan: {"rows": [{"item", "choice", "reason"}], "cost": {"paths", "seconds", "nbytes"}}.
+        plan: {"rows": [{"item", "choice", "reason"}], "cost": {"paths", "seconds", "nbytes"}}; where the plan
+            is one of several, also "planned_cost" and "preset_cost" likewise.
     """
     table = Table("item", "choice", "reason")
     for row in plan["rows"]:
-        table.add_row(*(Text(str(row[key])) for key in ("item", "choice", "reason")))
-    cost = plan["cost"]
-    return Group(
-        table,
-        Text(
-            f"cost: {cost['paths']:.3g} paths, about {human_seconds(cost['seconds'])}, {human_bytes(cost['nbytes'])}",
-            style="bold",
-        ),
-    )
+        style = "cyan" if row.get("by") == "you" else ""
+        table.add_row(*(Text(str(row[key]), style=style) for key in ("item", "choice", "reason")))
+    lines = [Text(f"cost: {_cost(plan['cost'])}", style="bold")]
+    if "planned_cost" in plan and plan["planned_cost"] != plan["preset_cost"]:
+        lines = [
+            Text(f"cost as planned (run --planned): {_cost(plan['planned_cost'])}", style="bold"),
+            Text(f"cost with the settings as given: {_cost(plan['preset_cost'])}"),
+        ]
+    return Group(table, *lines)
+
+
+def _cost(cost: Mapping[str, Any]) -> str:
+    return f"{cost['paths']:.3g} paths, about {human_seconds(cost['seconds'])}, {human_bytes(cost['nbytes'])}"
 
 
 def show(renderable: RenderableType, console: Console | None = None) -> None:

@@ -18,6 +18,7 @@ from workers.batch_matrix import BatchItem
 from workers.element_stage import run_elements
 from workers.errors import WorkerError
 from workers.pipeline import run_scene
+from workers.plan_stage import planned_run
 from workers.progress import Progress
 from workers.run_state import RunState
 from workers.scene import Scene, load_scene
@@ -81,10 +82,10 @@ def _open_item(item: BatchItem, store: Store, progress: Progress, loader: _Loade
     """The run of one combination: preset, then what the scene's file asks for, then the batch's settings."""
     scene = loader.load(item)
     if item.settings is not None:
-        return RunState(scene, store, item.settings, progress)
+        return planned_run(RunState(scene, store, item.settings, progress))
     size = {"width": scene.camera.width, "height": scene.camera.height}
-    settings = Settings.preset_named(item.preset_name).override({**size, **scene.settings, **item.overrides})
-    return RunState(scene, store, settings, progress)
+    settings = Settings.preset_named(item.preset_name).choose({**size, **scene.settings, **item.overrides})
+    return planned_run(RunState(scene, store, settings, progress))
 
 
 def plan_batch(items: list[BatchItem], store: Store, progress: Progress) -> list[dict[str, Any]]:

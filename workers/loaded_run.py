@@ -12,6 +12,7 @@ from workers.element_stage import run_elements
 from workers.elements import ElementSet
 from workers.job_spec import JobSpec
 from workers.pipeline import query_program
+from workers.plan_stage import planned_run
 from workers.progress import Progress
 from workers.query import QueryProgram
 from workers.run_state import RunState
@@ -52,7 +53,8 @@ def open_run(spec: JobSpec, store_url: str, progress: Progress) -> LoadedRun:
     loaded = _runs.get(key)
     if loaded is None:
         settings = Settings.from_json(spec.settings).override({})
-        run = RunState(_scene(spec.scene, settings), Store.open(store_url, create=True), settings)
+        run = RunState(_scene(spec.scene, settings), Store.open(store_url, create=True), settings, progress)
+        run = planned_run(run)
         loaded = _runs[key] = LoadedRun(run)
     loaded.run.progress = progress
     return loaded

@@ -19,7 +19,7 @@ from workers.errors import WorkerError
 from workers.evaluate import Evaluation, Picture, run_evaluation
 from workers.inputs import inputs_ref, run_inputs
 from workers.network_record import WEIGHTS_FILE, load_network
-from workers.plan import plan_rows
+from workers.plan_stage import planned_run
 from workers.progress import Progress
 from workers.query import QueryProgram
 from workers.reconstruct import Reconstructor
@@ -27,6 +27,7 @@ from workers.render import render_ref, run_render
 from workers.renderer import FrameRenderer, publish
 from workers.run_state import RunState
 from workers.scene import Scene
+from workers.scene_plan import plan_rows
 from workers.settings import Settings
 from workers.train import run_train, train_ref
 
@@ -57,6 +58,7 @@ def run_scene(
     width, height = camera_size or (settings.width, settings.height)
     run = RunState(scene, store, settings.override({"width": width, "height": height}), progress)
     store.register_scene(scene.digest, known_facts(store, scene) | {"name": scene.name, "source": str(scene.source)})
+    run = planned_run(run)
     elements = run_elements(run)
     run_bake(run, elements)
     frames = run.settings.frames
@@ -86,7 +88,7 @@ def evaluate_scene(scene: Scene, store: Store, settings: Settings, progress: Pro
     if "network" in entry:
         check_versions(entry, store.url)
     used = Settings.from_json(entry["settings"]) if "settings" in entry else settings
-    run = RunState(scene, store, used, progress)
+    run = planned_run(RunState(scene, store, used, progress))
     elements = run_elements(run)
     renders = {name: [render_ref(run, camera, spp) for camera in cameras] for name, cameras, spp in (
         ("train", run.paths.train, used.frames.train_spp), ("test", run.paths.test, used.frames.test_spp))}  # fmt: skip

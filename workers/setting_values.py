@@ -46,6 +46,7 @@ RANGES: Mapping[str, tuple[float, float]] = MappingProxyType(
         "train.clip_norm": (1e-6, 1_000_000),
         "evaluation.spp": (1, _MOST_SPP),
         "evaluation.timing_repeats": (1, 100_000),
+        "plan.noise": (1e-4, 10.0),
     }
 )
 """Smallest and largest value of every numeric setting, both allowed; of each entry where the setting is a list."""

@@ -155,6 +155,22 @@ class EvaluationSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PlanSettings:
+    """Who decides what a scene requires (`workers/planner.py`).
+
+    Attributes:
+        mode: "preset" (the preset's numbers as they are), "adaptive" (a plan of the scene replaces them before the
+            first stage) or "applied" (it has).
+        noise: relative standard error of each lobe over the frame, after the caches' filter, that the plan aims at.
+        keep: settings that the plan must leave as they are, by dotted key.
+    """
+
+    mode: Literal["preset", "adaptive", "applied"] = "preset"
+    noise: float = 0.04
+    keep: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
 class Settings:
     """All settings of a run."""
 
@@ -166,6 +182,7 @@ class Settings:
     frames: FrameSettings = field(default_factory=FrameSettings)
     train: TrainSettings = field(default_factory=TrainSettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
+    plan: PlanSettings = field(default_factory=PlanSettings)
 
     @classmethod
     def preset_named(cls, name: str) -> "Settings":
@@ -189,6 +206,16 @@ class Settings:
             result = _set(result, key.split("."), value, key)
         _check(result)
         return result
+
+    def choose(self, values: dict[str, Any]) -> Self:
+        """`override` by a person: a plan leaves these settings as they are.
+
+        Raises:
+            SettingsError: as `override`.
+        """
+        chosen = self.override(values)
+        keep = {*chosen.plan.keep, *(key for key in values if "." in key and not key.startswith("plan."))}
+        return chosen.override({"plan.keep": tuple(sorted(keep))})
 
     def to_json(self) -> dict[str, Any]:
         """Plain nested dict."""

@@ -29,6 +29,7 @@ from workers.network_record import load_network
 from workers.operating_points import FrameTime, OperatingPoint
 from workers.operating_table import OperatingTable, save_table
 from workers.pareto import pareto_front
+from workers.plan_stage import planned_run
 from workers.point_parts import derived_run
 from workers.progress import Progress
 from workers.reconstruct import Reconstructor
@@ -62,7 +63,7 @@ def run_tradeoff(
     known = next((entry for entry in store.scenes() if entry["digest"] == scene.digest), None)
     if known is None:
         store.register_scene(scene.digest, {"name": scene.name, "source": str(scene.source)})
-    base = base_run(RunState(scene, store, settings, progress), budget)
+    base = base_run(planned_run(RunState(scene, store, settings, progress)), budget)
     prepared = prepare_variants(base, budget)
     test_refs = run_render(base, base.paths.test, base.settings.frames.test_spp, "render test references")
     reference = load_reference(base, test_refs, prepared[0].exposure)

@@ -66,16 +66,11 @@ def domain_hits(
 def _pose_hits(
     mi_scene: "mi.Scene", table: SurfaceTable, pose: Camera, target_width: int, rays: int, index: int
 ) -> list[Hits]:
-    scale = np.sqrt(rays / (pose.width * pose.height))
-    width, height = max(1, round(pose.width * scale)), max(1, round(pose.height * scale))
-    lane = dr.arange(mi.UInt32, width * height)
-    rng = mi.PCG32(width * height, initstate=dr.opaque(mi.UInt64, index), initseq=mi.UInt64(lane))
-    x, y = lane % width, lane // width
-    camera = DeviceCamera.upload(table.frame.local_camera(pose))
-    ray = camera.ray(x + rng.next_float32(), y + rng.next_float32(), width, height)
+    ray = pose_rays(table, pose, rays, index)
+    count = dr.width(ray)
     pixel = dr.opaque(mi.Float, 2 * np.tan(np.radians(pose.fov_deg) / 2) / target_width)
     follows = bool(table.lobe_union & LobeClass.DELTA)
-    waves = [(ray, dr.zeros(mi.Float, width * height), 0)]
+    waves = [(ray, dr.zeros(mi.Float, count), 0)]
     found = []
     while waves:
         ray, travelled, depth = waves.pop()
@@ -93,6 +88,24 @@ def _pose_hits(
                 next_ray = dr.gather(mi.Ray3f, next_ray, lanes)
                 waves.append((next_ray, dr.gather(mi.Float, travelled, lanes), depth + 1))
     return found
+
+
+def pose_rays(table: SurfaceTable, pose: Camera, rays: int, index: int) -> "mi.Ray3f":
+    """Rays of a pose in the table's local units, one a cell of a raster with the image's aspect, jittered.
+
+    Args:
+        table: says in which frame the scene lies.
+        pose: the camera.
+        rays: about how many.
+        index: of the pose, which seeds the jitter.
+    """
+    scale = np.sqrt(rays / (pose.width * pose.height))
+    width, height = max(1, round(pose.width * scale)), max(1, round(pose.height * scale))
+    lane = dr.arange(mi.UInt32, width * height)
+    rng = mi.PCG32(width * height, initstate=dr.opaque(mi.UInt64, index), initseq=mi.UInt64(lane))
+    x, y = lane % width, lane // width
+    camera = DeviceCamera.upload(table.frame.local_camera(pose))
+    return camera.ray(x + rng.next_float32(), y + rng.next_float32(), width, height)
 
 
 def _hits(table, pi, si, footprint, ray):

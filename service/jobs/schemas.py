@@ -147,6 +147,8 @@ class PlanRow(BaseModel):
     item: str
     choice: str
     reason: str
+    settings: list[str] = Field(default=[], description="settings that override it")
+    by: Literal["plan", "you"] = Field(default="plan", description="whether such a setting was given")
 
 
 class PlanCost(BaseModel):
@@ -163,7 +165,10 @@ class PlanView(BaseModel):
     model_config = ConfigDict(extra="allow")
 
     rows: list[PlanRow]
-    cost: PlanCost
+    cost: PlanCost = Field(description="of a job with these settings")
+    planned_cost: PlanCost | None = Field(default=None, description="with the setting plan.mode = adaptive")
+    overrides: dict[str, Any] = Field(default={}, description="settings that an adaptive plan changes")
+    network_needed: bool = Field(default=True, description="false where the caches alone are predicted to do")
 
 
 def _time(seconds: float | None) -> Any:

@@ -57,7 +57,7 @@ class Desk:
         source = self.resolve_scene_source(request.scene)
         wish = self.read_scene(source)
         size = {"width": wish.width, "height": wish.height}
-        settings = Settings.preset_named(request.preset).override({**size, **wish.settings, **request.settings})
+        settings = Settings.preset_named(request.preset).choose({**size, **wish.settings, **request.settings})
         self._check_size(settings)
         return source, settings
 

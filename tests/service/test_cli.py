@@ -169,9 +169,17 @@ def test_demo_ends_with_table_report_and_a_frame_request_that_works(calls: Any, 
 
 
 def test_plan_prints_choices_and_cost_and_makes_no_store(calls: Any, tmp_path: Path) -> None:
-    result = invoke("plan", "scene.xml")
+    result = invoke("plan", "scene.xml", "--json", str(tmp_path / "plan.json"))
     assert result.exit_code == 0 and "walls are large" in result.stdout and "1 min 00 s" in result.stdout
     assert [name for name, _ in calls] == ["load_scene"]
+    assert json.loads((tmp_path / "plan.json").read_text())["rows"][0]["item"] == "elements"
+
+
+def test_planned_run_asks_for_a_plan_and_keeps_what_was_set(calls: Any, store: str) -> None:
+    assert invoke("run", "scene.xml", "--store", store, "--planned", "--set", "cache.polar=6").exit_code == 0
+    assert invoke("run", "scene.xml", "--store", store).exit_code == 0
+    plans = [facts["settings"].plan for name, facts in calls if name == "run_scene"]
+    assert [(plan.mode, plan.keep) for plan in plans] == [("adaptive", ("cache.polar",)), ("preset", ())]
 
 
 def test_evaluate_prints_the_table(calls: Any, store: str) -> None:

@@ -51,6 +51,14 @@ def test_plan_table_shows_choice_reason_and_cost() -> None:
     assert "rough gold [0.2]" in text and "cost: 2.5e+08 paths, about 2 min 05 s, 1.0 MiB" in text
 
 
+def test_plan_table_shows_both_costs_where_the_plan_differs_from_the_settings() -> None:
+    cheap, dear = ({"paths": 1e6, "seconds": seconds, "nbytes": 1024} for seconds in (30, 60))
+    plan = {"rows": [], "cost": dear, "planned_cost": cheap, "preset_cost": dear}
+    text = printed(plan_table(plan))
+    assert "as planned (run --planned): 1e+06 paths, about 30.0 s" in text and "as given: 1e+06 paths" in text
+    assert "as planned" not in printed(plan_table({**plan, "planned_cost": dear}))
+
+
 def test_show_keeps_columns_whole_where_there_is_no_terminal(evaluation: Any) -> None:
     narrow = Console(file=io.StringIO(), width=40)
     show(score_table(evaluation.result), narrow)

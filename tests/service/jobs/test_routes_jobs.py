@@ -247,7 +247,8 @@ def test_a_preview_before_any_pass_is_409(client: httpx.Client, runner: Any) -> 
 def test_a_plan_says_what_a_job_would_do_and_makes_none(client: httpx.Client, jobs: Jobs) -> None:
     answer = client.post("/v1/plan", json=BODY)
     assert answer.status_code == 200, answer.text
-    assert answer.json()["rows"] == [{"item": "size", "choice": "48x32", "reason": "tiny"}]
+    row = {"item": "size", "choice": "48x32", "reason": "tiny", "settings": [], "by": "plan"}
+    assert answer.json()["rows"] == [row]
     assert answer.json()["cost"]["paths"] == 10 and jobs.table.page() == []
     assert_problem(client.post("/v1/plan", json={**BODY, "preset": "best"}), 422, "preset must be one of")
 
