@@ -9,9 +9,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from workers.backend import dr, mi
+from workers.direction_grids import MIN_AZIMUTH, MIN_POLAR
 from workers.elements import NO_SLOT, NOT_BAKED, ElementSet
 from workers.lobes import LobeClass, diffuse_reflectance, has, specular_tint
 from workers.surfaces import SurfaceTable
+from workers.texels import (
+    EXPONENT_SHIFT,
+    FIELD_BITS,
+    FIELD_MASK,
+    TEXELS_PER_BLOCK,
+    DirectionalTexels,
+    exponent_bias,
+)
 
 GRAZING_COSINE = 0.02
 STAND_IN_WEIGHT = 1e-4  # a stand-in counts only where no baked point does
@@ -23,15 +32,22 @@ class CacheArrays:
 
     Attributes:
         diffuse: D (or the diffuse lobe itself, not demodulated) of every element, float32 [n, 3].
-        directional: S of the elements in `ElementSet.glossy`, float32 [g, polar, azimuth, 3].
+        directional: S of the elements in `ElementSet.glossy`; float32 [g, polar, azimuth, 3] is one grid for all.
         demodulated: whether `diffuse` is to be multiplied by the pixel's reflectance.
         exitant: whether `directional` holds all of the exitant radiance (paper-exact).
     """
 
     diffuse: np.ndarray
-    directional: np.ndarray
+    directional: DirectionalTexels | np.ndarray
     demodulated: bool = True
     exitant: bool = False
+
+    @property
+    def texels(self) -> DirectionalTexels:
+        """The directional cache as the query reads it."""
+        if isinstance(self.directional, DirectionalTexels):
+            return self.directional
+        return DirectionalTexels.uniform(self.directional)
 
 
 @dataclass
@@ -62,9 +78,16 @@ class CacheShading:
             mi.UInt32(elements.glossy_slot),
         )
         self.diffuse = mi.Float(_four_channels(caches.diffuse))
-        self.polar, self.azimuth = caches.directional.shape[1:3] if caches.directional.ndim == 4 else (1, 1)
-        self.directional = mi.Float(_four_channels(caches.directional))
-        self.glossy_normal = mi.Float(_four_channels(elements.normal[elements.glossy]))
+        texels = caches.texels
+        self.grid, self.packing, self.on_ladder = texels.grid, texels.packing, texels.rung is not None
+        if texels.packing is None:
+            self.directional = mi.Float(_four_channels(texels.values))
+        else:
+            self.directional = mi.UInt32(texels.values if len(texels.values) else np.zeros(1, np.uint32))
+        normals = _four_channels(elements.normal[elements.glossy])
+        if self.on_ladder and len(elements.glossy):  # the packet's fourth float tells where the slot's grid lies
+            normals.reshape(-1, 4)[:, 3] = texels.locators().view(np.float32)
+        self.glossy_normal = mi.Float(normals)
         self.glossy_position = mi.Float(_four_channels(elements.position[elements.glossy]))
         self.is_parametric = mi.UInt32(table.is_parametric.astype(np.uint32))
         self.has_diffuse = bool(np.any(elements.diffuse_slot != NO_SLOT))
@@ -182,9 +205,11 @@ class CacheShading:
             for point, weight in zip(points, weights, strict=True):
                 slot, baked = self.slot(self.glossy_slot, point, active)
                 weight = dr.select(baked, weight, weight * STAND_IN_WEIGHT)
-                n = xyz(dr.gather(mi.Vector4f, self.glossy_normal, slot, active))
+                packet = dr.gather(mi.Vector4f, self.glossy_normal, slot, active)
+                n = xyz(packet)
                 direction = 2 * dr.dot(mirrored, n) * n - mirrored if reflect else view
-                value += self._bilinear(slot, mi.Frame3f(n).to_local(direction), active) * weight
+                grid = self._grid(slot, packet.w)
+                value += self._bilinear(grid, mi.Frame3f(n).to_local(direction), active) * weight
                 covered += dr.select(baked, weight, 0.0)
                 total += weight
             scale = dr.select(active, dr.rcp(dr.maximum(total, 1e-20)), 0.0)
@@ -199,25 +224,52 @@ class CacheShading:
         raw = dr.gather(mi.UInt32, table, point, active)
         return raw & mi.UInt32(int(NOT_BAKED) - 1), (raw & mi.UInt32(int(NOT_BAKED))) == 0
 
-    def _bilinear(self, slot, local, active):
+    def _grid(self, slot, locator):
+        """(first texel, azimuth, polar) of a slot's grid; see `DirectionalTexels.locators`."""
+        if not self.on_ladder:
+            azimuth, polar = self.grid
+            return slot * (azimuth * polar), mi.UInt32(azimuth), mi.UInt32(polar)
+        where = dr.reinterpret_array(mi.UInt32, locator)
+        rung = where & 7
+        return (where >> 3) * TEXELS_PER_BLOCK, mi.UInt32(MIN_AZIMUTH) << rung, mi.UInt32(MIN_POLAR) << rung
+
+    def _bilinear(self, grid, local, active):
         """Bilinear lookup by polar angle and azimuth of one element's grid."""
+        first, azimuth, polar = grid
+        columns, rows = mi.Float(azimuth), mi.Float(polar)
         cos_theta = dr.maximum(local.z, GRAZING_COSINE)
-        theta = dr.safe_acos(cos_theta) * (2 / dr.pi) * self.polar - 0.5
-        phi = dr.atan2(local.y, local.x) * dr.inv_two_pi * self.azimuth - 0.5
-        phi = dr.select(phi < 0, phi + self.azimuth, phi)
-        row = dr.clip(dr.floor(theta), 0.0, max(self.polar - 2, 0))
+        theta = dr.safe_acos(cos_theta) * (2 / dr.pi) * rows - 0.5
+        phi = dr.atan2(local.y, local.x) * dr.inv_two_pi * columns - 0.5
+        phi = dr.select(phi < 0, phi + columns, phi)
+        row = dr.clip(dr.floor(theta), 0.0, dr.maximum(rows - 2, 0.0))
         column = dr.floor(phi)
         ft, fp = dr.clip(theta - row, 0.0, 1.0), phi - column
         r0 = mi.UInt32(row)
-        r1 = dr.minimum(r0 + 1, self.polar - 1)
-        c0 = mi.UInt32(column) % self.azimuth
-        c1 = (c0 + 1) % self.azimuth
+        r1 = dr.minimum(r0 + 1, polar - 1)
+        c0 = self._wrapped(mi.UInt32(column), azimuth)
+        c1 = self._wrapped(c0 + 1, azimuth)
         result = mi.Color3f(0)
         for r, c, w in ((r0, c0, (1 - ft) * (1 - fp)), (r0, c1, (1 - ft) * fp), (r1, c0, ft * (1 - fp)),
                         (r1, c1, ft * fp)):  # fmt: skip
-            index = (slot * self.polar + r) * self.azimuth + c
-            result += mi.Color3f(xyz(dr.gather(mi.Vector4f, self.directional, index, active))) * w
+            result += self._texel(first + r * azimuth + c, w, active)
         return result
+
+    def _wrapped(self, column, azimuth):
+        return column & (azimuth - 1) if self.on_ladder else column % azimuth
+
+    def _texel(self, index, weight, active):
+        """A texel of the directional cache times its weight; `texels.unpack` on the device."""
+        if self.packing is None:
+            return mi.Color3f(xyz(dr.gather(mi.Vector4f, self.directional, index, active))) * weight
+        packed = dr.gather(mi.UInt32, self.directional, index, active)
+        exponent = (packed >> EXPONENT_SHIFT) + exponent_bias(self.packing)
+        factor = dr.reinterpret_array(mi.Float, exponent << 23) * weight
+        fields = [packed, packed >> FIELD_BITS, packed >> 2 * FIELD_BITS]
+        if self.packing.signed:
+            above = 32 - FIELD_BITS
+            signed = [dr.reinterpret_array(mi.Int32, field << above) >> above for field in fields]
+            return mi.Color3f(*(mi.Float(value) for value in signed)) * factor
+        return mi.Color3f(*(mi.Float(mi.Int32(field & FIELD_MASK)) for field in fields)) * factor
 
 
 class _AskedOnce:
