@@ -12,7 +12,7 @@ Record = Mapping[str, Any]
 PARTS = (
     ("primary", "primary rays alone (1 a pixel)"),
     ("query-1x1", "query with G-buffers, 1x1"),
-    ("query", "query with G-buffers, {samples}x{samples} (this run)"),
+    ("query", "query with G-buffers, {samples}x{samples}{where} (this run)"),
     ("network", "network"),
     ("frame", "**whole frame**"),
     ("pt-1", "path tracing, 1 spp"),
@@ -144,7 +144,10 @@ def _stages(result: Mapping[str, Any]) -> list[str]:
 
 def _frame_times(times: Mapping[str, Any]) -> list[str]:
     ms, network = times["ms"], times["network"]
-    rows = [[title.format(samples=times["samples"]), f"{ms[key]:.1f}"] for key, title in PARTS if key in ms]
+    where = " at edges" if times.get("supersample") == "edges" else ""
+    rows = [
+        [title.format(samples=times["samples"], where=where), f"{ms[key]:.1f}"] for key, title in PARTS if key in ms
+    ]
     peaks = network["peak_gflop_per_s"]
     peak_text = ", ".join(f"{name} {rate:.0f} GFLOP/s" for name, rate in peaks.items())
     ratios = "; ".join(f"{name}: {ratio:.2f}" for name, ratio in times["ratios"].items())

@@ -61,6 +61,7 @@ def variants(settings: Settings) -> list[Variant]:
         Variant("ours, L1 only", {"train.perceptual_weight": 0.0}),
         Variant("ours, perceptual only", {"train.l1_weight": 0.0, "train.perceptual_weight": 1.0}),
         Variant("ours, 1x1 query", {"query.samples": 1}),
+        Variant("ours, 2x2 query everywhere", {"query.supersample": "everywhere"}),
         Variant("ours", {}),
     ]  # fmt: skip
 

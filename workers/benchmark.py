@@ -102,8 +102,8 @@ def frame_times(
         progress: told round by round.
 
     Returns:
-        "width", "height", "repeats", "samples" (of the run's query, along each axis); "ms" by part: "primary"
-        (one ray a pixel, nothing but the intersection), "query-1x1", "query" (the run's own samples),
+        "width", "height", "repeats", "samples" (of the run's query, along each axis), "supersample"; "ms" by part:
+        "primary" (one ray a pixel, nothing but the intersection), "query-1x1", "query" (the run's own samples),
         "network", "frame" (query and network), "pt-1" (one path a pixel), "oidn-<quality>" (Open Image
         Denoise alone, with albedo and normal); "ratios" of them; "network" as `network_rate` returns it.
     """
@@ -130,13 +130,14 @@ def frame_times(
     milliseconds = {name: 1e3 * seconds for name, seconds in medians.items()}
     return {
         "width": width, "height": height, "repeats": repeats, "samples": renderer.program.settings.samples,
+        "supersample": renderer.program.settings.supersample,
         "ms": milliseconds, "ratios": _ratios(milliseconds),
         "network": network_rate(renderer.reconstructor, width, height, medians["network"]),
     }  # fmt: skip
 
 
 def _ratios(milliseconds: dict[str, float]) -> dict[str, float]:
-    pairs = [("query-1x1", "primary"), ("query", "primary"), ("frame", "oidn-fast")]
+    pairs = [("query-1x1", "primary"), ("query", "primary"), ("frame", "oidn-fast"), ("frame", "oidn-balanced")]
     ratios = {f"{a} / {b}": milliseconds[a] / milliseconds[b] for a, b in pairs}
     whole = milliseconds["pt-1"] + milliseconds["oidn-fast"]
     return ratios | {"frame / (pt-1 + oidn-fast)": milliseconds["frame"] / whole}

@@ -2,9 +2,9 @@
 
 Every primary ray finds its patch and the three lattice points around its hit, gathers what they cached and
 multiplies by the material at the pixel (`workers/query_shading.py`); delta surfaces are followed (both lobes
-at the first one, the likelier afterwards) to what lies behind. The program is traced once for each image size
-and then replayed (`dr.freeze`): the pose and the caches are its inputs. `workers/query_reference.py` is the
-same in slow NumPy.
+at the first one, the likelier afterwards) to what lies behind. Pixels on edges get more samples
+(`workers/supersampling.py`). The program is traced once for each image size and then replayed (`dr.freeze`): the
+pose and the caches are its inputs. `workers/query_reference.py` is the same in slow NumPy.
 """
 
 import gc
@@ -21,6 +21,7 @@ from workers.lobes import LobeClass, has
 from workers.primary import DeltaLobe, DeviceCamera, delta_lobes, dominant_lobe
 from workers.query_shading import CacheArrays, CacheShading, xyz
 from workers.settings import QuerySettings
+from workers.supersampling import edge_pixels, edge_places, grid_places
 from workers.surfaces import SurfaceTable
 
 __all__ = ["CHANNELS", "NUM_CHANNELS", "CacheArrays", "QueryProgram"]
@@ -29,12 +30,10 @@ CHANNELS = {
     "ir": (0, 3), "normal": (3, 6), "albedo": (6, 9), "distance": (9, 10), "coverage": (10, 11),
     "position": (11, 14),
 }  # fmt: skip
-NUM_CHANNELS = 16  # padded: one packet scatter a pixel
+NUM_CHANNELS = 16  # with the number of lookups and a pad: one packet scatter a pixel
 PAPER_DELTA = 0.01
 MIN_BRANCH = 0.01  # a reflection weaker than this is not followed from the first delta surface
 MAX_RECORDINGS = 8  # image sizes whose recorded programs are kept
-# Sample places in a pixel, by samples along each axis.
-_GRIDS = {n: [((i + 0.5) / n, (j + 0.5) / n) for j in range(n) for i in range(n)] for n in (1, 2, 3, 4)}
 
 
 @dataclass
@@ -60,7 +59,10 @@ class QueryProgram:
         self.scene, self.table, self.settings = mi_scene, table, settings
         self.shading = CacheShading(mi_scene, table, elements, caches)
         self.follows_delta = bool(table.lobe_union & LobeClass.DELTA) and not caches.exitant
-        self._places = mi.Float(np.array(_GRIDS[settings.samples], np.float32).reshape(-1))
+        self.finds_edges = settings.samples > 1 and settings.supersample == "edges"
+        places = edge_places(settings.samples) if self.finds_edges else grid_places(settings.samples)
+        self._num_places = len(places)
+        self._places = mi.Float(places.astype(np.float32).reshape(-1))
         self._state = (self._places, *self.shading.state())
         program = self._program if settings.weights == "barycentric" else self._paper_program
         self._program_unfrozen = program
@@ -96,12 +98,14 @@ class QueryProgram:
         """One frame, flat [height * width * NUM_CHANNELS]."""
         lane = dr.arange(mi.UInt32, width * height)
         x, y = mi.Float(lane % width), mi.Float(lane // width)
-        count = len(_GRIDS[self.settings.samples])
-        if count == 1:
-            walk = self._walk(device.ray(x + 0.5, y + 0.5, width, height))
-        else:
-            walk = self._average(device, x, y, width, height, count)
-        return self._store(lane, walk)
+        if self.settings.samples > 1 and not self.finds_edges:
+            return self._store(lane, self._average(device, x, y, width, height, self._num_places))
+        image = self._store(lane, self._walk(device.ray(x + 0.5, y + 0.5, width, height)))
+        if self.finds_edges:
+            edges = edge_pixels(image, width, height, NUM_CHANNELS)
+            dr.eval(edges)
+            self._refine(image, device, edges, width, height)
+        return image
 
     @dr.syntax
     def _average(self, device, x, y, width: int, height: int, count: int):
@@ -126,15 +130,46 @@ class QueryProgram:
             radiance * scale, albedo * scale, normal * scale, distance * scale, position, covered, asked
         )  # fmt: skip
 
+    @dr.syntax
+    def _refine(self, image, device, pixel, width: int, height: int):
+        """Averages further samples into some pixels of an image; the place of the first sample stays."""
+        active = pixel < width * height
+        pixel = dr.select(active, pixel, 0)
+        x, y = mi.Float(pixel % width), mi.Float(pixel // width)
+        packets = NUM_CHANNELS // 4
+        first = [value for k in range(packets) for value in dr.gather(mi.Vector4f, image, pixel * packets + k, active)]
+        radiance, normal, albedo = mi.Color3f(first[0:3]), mi.Vector3f(first[3:6]), mi.Color3f(first[6:9])
+        distance, asked = mi.Float(first[9]), mi.Float(first[14])
+        covered = first[10] * asked
+        distance *= self.table.frame.scale
+        index = dr.zeros(mi.UInt32, dr.width(pixel))
+        while active & (index < self._num_places):
+            place = dr.gather(mi.Point2f, self._places, index)
+            walk = self._walk(device.ray(x + place.x, y + place.y, width, height))
+            radiance += walk.radiance
+            albedo += walk.albedo
+            normal += walk.normal
+            distance += walk.distance
+            covered += walk.covered
+            asked += walk.asked
+            index += 1
+        scale = 1.0 / (1 + self._num_places)
+        position = mi.Point3f(first[11:14]) * self.table.frame.scale
+        mean = _Walk(radiance * scale, albedo * scale, normal * scale, distance * scale, position, covered, asked)
+        dr.scatter(image, mi.ArrayXf(self._channels(mean)), pixel, active)
+
     def _store(self, pixel, walk: _Walk) -> "mi.Float":
         buffer = dr.empty(mi.Float, dr.width(pixel) * NUM_CHANNELS)
+        dr.scatter(buffer, mi.ArrayXf(self._channels(walk)), pixel)
+        return buffer
+
+    def _channels(self, walk: _Walk) -> "list[mi.Float]":
+        """By `CHANNELS`, then the number of lookups."""
         coverage = dr.select(walk.asked > 0, walk.covered / walk.asked, 1.0)
         unit = 1.0 / self.table.frame.scale  # scene units
         place = (walk.distance * unit, coverage, *(walk.position * unit))
         values = [*walk.radiance, *walk.normal, *walk.albedo, *place]
-        values += [mi.Float(0)] * (NUM_CHANNELS - len(values))
-        dr.scatter(buffer, mi.ArrayXf(values), pixel)
-        return buffer
+        return [*values, walk.asked, mi.Float(0)]
 
     # ------------------------------------------- walking -------------------------------------------
 

@@ -19,6 +19,14 @@ from workers.lobes import LobeClass, diffuse_reflectance, specular_tint
 from workers.primary import delta_lobes, dominant_lobe
 from workers.query import CacheArrays
 from workers.settings import QuerySettings
+from workers.supersampling import (
+    MAX_ALBEDO_STEP,
+    MAX_BEND,
+    MAX_RADIANCE_STEP,
+    MAX_TURN,
+    edge_places,
+    grid_places,
+)
 from workers.surfaces import SurfaceTable
 
 STAND_IN_WEIGHT = 1e-4  # a point that was not baked counts only where no baked point does
@@ -285,24 +293,67 @@ def query_reference(
     camera, unit = table.frame.local_camera(camera), 1.0 / table.frame.scale
     y, x = (axis.reshape(-1) for axis in np.mgrid[: camera.height, : camera.width])
     if settings.weights == "barycentric":
-        n = settings.samples
-        walks = [
-            query.walk(*camera_rays(camera, x + (i + 0.5) / n, y + (j + 0.5) / n)) for j in range(n) for i in range(n)
-        ]
-        radiance = np.mean([walk["ir"] for walk in walks], axis=0)
+        walks = [query.walk(*camera_rays(camera, x + i, y + j)) for i, j in _places(settings)]
+        taken = np.ones((len(walks), len(x), 1))
+        if settings.samples > 1 and settings.supersample == "edges":
+            taken[1:] = edge_contrast(walks[0], camera).reshape(1, -1, 1) > 1
+        radiance = _mean(walks, "ir", taken)
     else:
         offsets = [(0, 0), (1, 0), (0, 1)] if settings.weights == "paper" else [(0, 0)]
         rays = [query.walk(*camera_rays(camera, x + 0.5 + i, y + 0.5 + j)) for i, j in offsets]
         weight = np.stack([ray["paper_weight"] for ray in rays])[..., None]
         radiance = (weight * [ray["ir"] for ray in rays]).sum(0) / weight.sum(0)
-        walks = rays[:1]
-    baked, asked = (np.sum([walk[name] for walk in walks], axis=0) for name in ("baked", "asked"))
+        walks, taken = rays[:1], np.ones((1, len(x), 1))
+    baked, asked = (np.sum([walk[name] for walk in walks] * taken[..., 0], axis=0) for name in ("baked", "asked"))
     with np.errstate(invalid="ignore"):
         coverage = np.where(asked > 0, baked / asked, 1.0)[:, None]
-    image = {name: np.mean([walk[name] for walk in walks], axis=0) for name in ("normal", "albedo", "distance")}
+    image = {name: _mean(walks, name, taken) for name in ("normal", "albedo", "distance")}
     image["distance"] = image["distance"] * unit
     image |= {"ir": radiance, "coverage": coverage, "position": walks[0]["position"] * unit}
     return {name: value.reshape(camera.height, camera.width, -1) for name, value in image.items()}
+
+
+def _places(settings: QuerySettings) -> np.ndarray:
+    """[n, 2] places of a pixel's samples, the one that every pixel has first."""
+    if settings.samples > 1 and settings.supersample == "edges":
+        return np.concatenate([[(0.5, 0.5)], edge_places(settings.samples)])
+    return grid_places(settings.samples)
+
+
+def _mean(walks: list[dict[str, np.ndarray]], name: str, taken: np.ndarray) -> np.ndarray:
+    """Mean of a channel over the samples that were taken, [n, components]."""
+    values = np.stack([walk[name] for walk in walks])
+    return np.sum(np.where(taken > 0, values, 0.0), axis=0) / taken.sum(0)
+
+
+def edge_contrast(look: dict[str, np.ndarray], camera: Camera) -> np.ndarray:
+    """How far a pixel differs from its four neighbours, as a share of what makes it an edge: [height, width].
+
+    Args:
+        look: radiance "ir", "normal", "albedo" and "distance" of one sample a pixel.
+        camera: gives the size.
+    """
+    ir, normal, albedo, distance = (
+        np.pad(look[name].reshape(camera.height, camera.width, -1), ((1, 1), (1, 1), (0, 0)), mode="edge")
+        for name in ("ir", "normal", "albedo", "distance")
+    )
+    nearness = np.divide(1.0, distance, out=np.zeros_like(distance), where=distance > 0)[..., 0]
+    centre = (slice(1, -1), slice(1, -1))
+    contrast = np.zeros((camera.height, camera.width))
+    for back, on in (((1, 0), (1, 2)), ((0, 1), (2, 1))):  # rows and columns to start at
+        before, after = ((slice(i, i + camera.height), slice(j, j + camera.width)) for i, j in (back, on))
+        for other in (before, after):
+            brighter = np.maximum(ir[centre].max(-1), ir[other].max(-1))
+            step = np.abs(ir[centre] - ir[other]).max(-1)
+            relative = np.divide(step, brighter, out=np.zeros_like(step), where=brighter > 0)
+            turn = np.linalg.norm(normal[centre] - normal[other], axis=-1)
+            contrast = np.maximum(contrast, turn / MAX_TURN)
+            contrast = np.maximum(contrast, np.abs(albedo[centre] - albedo[other]).max(-1) / MAX_ALBEDO_STEP)
+            contrast = np.maximum(contrast, relative / MAX_RADIANCE_STEP)
+        bend = np.abs(nearness[before] + nearness[after] - 2 * nearness[centre])
+        share = np.divide(bend, nearness[centre], out=np.full_like(bend, np.inf), where=nearness[centre] > 0)
+        contrast = np.maximum(contrast, np.where(bend > 0, share / MAX_BEND, 0.0))
+    return contrast
 
 
 def bilinear(grids: np.ndarray, slot: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:

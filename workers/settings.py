@@ -68,13 +68,16 @@ class QuerySettings:
     """How caches become an image.
 
     Attributes:
-        samples: primary rays per pixel along each axis: 1 or 2 (2x2).
+        samples: primary rays per pixel along each axis, 1 to 4.
+        supersample: "edges" takes only the first of them where neighbouring pixels see one smooth surface
+            (`workers/supersampling.py`), "everywhere" takes all of them.
         weights: "barycentric", or "paper" (three rays a pixel, W = Wd Wn + 0.01).
         scale_free: paper weights only: divide the distance by the primitive's size.
         max_chain: delta bounces followed at most.
     """
 
     samples: int = 2
+    supersample: Literal["edges", "everywhere"] = "edges"
     weights: Literal["barycentric", "paper", "single"] = "barycentric"
     scale_free: bool = False
     max_chain: int = 8

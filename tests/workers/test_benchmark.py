@@ -151,6 +151,7 @@ def test_frame_ratios_are_those_of_the_times(times: dict[str, Any]) -> None:
         "query-1x1 / primary": ms["query-1x1"] / ms["primary"],
         "query / primary": ms["query"] / ms["primary"],
         "frame / oidn-fast": ms["frame"] / ms["oidn-fast"],
+        "frame / oidn-balanced": ms["frame"] / ms["oidn-balanced"],
         "frame / (pt-1 + oidn-fast)": ms["frame"] / (ms["pt-1"] + ms["oidn-fast"]),
     }
 

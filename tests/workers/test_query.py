@@ -146,13 +146,15 @@ PAPER = CacheSettings(elements="triangle", lobes="exitant")
     [
         (LATTICE, QuerySettings(samples=1)),
         (LATTICE, QuerySettings(samples=2)),
+        (LATTICE, QuerySettings(samples=3)),
+        (LATTICE, QuerySettings(samples=2, supersample="everywhere")),
         (CacheSettings(elements="vertex"), QuerySettings(samples=1)),
-        (CacheSettings(max_elements=800, lobes="exitant"), QuerySettings(samples=2)),
+        (CacheSettings(max_elements=800, lobes="exitant"), QuerySettings(samples=2, supersample="everywhere")),
         (PAPER, QuerySettings(weights="paper")),
         (PAPER, QuerySettings(weights="single")),
         (PAPER, QuerySettings(weights="paper", scale_free=True)),
     ],
-    ids=["1x1", "2x2", "vertex", "exitant", "paper-3", "paper-1", "paper-scale-free"],
+    ids=["1x1", "edges", "edges-3x3", "2x2", "vertex", "exitant", "paper-3", "paper-1", "paper-scale-free"],
 )
 def test_program_agrees_with_the_reference(tiny: Seen, cache: CacheSettings, query: QuerySettings) -> None:
     check_against_reference(tiny, cache, query)
