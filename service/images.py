@@ -4,6 +4,7 @@ Radiance is [height, width, 3] float32, linear, Rec.709 primaries, row 0 on top.
 `srgb(clip(exposure * radiance, 0, 1))` in 8 bits, as the metrics see it; EXR keeps the radiance itself.
 """
 
+import functools
 import io
 import zlib
 from collections.abc import Sequence
@@ -20,6 +21,7 @@ MEDIA_TYPES = (PNG, JPEG, EXR)
 
 MEDIA_TYPE_OF_SUFFIX = {".png": PNG, ".jpg": JPEG, ".jpeg": JPEG, ".exr": EXR}
 JPEG_QUALITY = 93
+_TABLE_MAX = 65535
 NON_FINITE_COLOUR = (255, 0, 255)
 """Pixels that hold NaN or infinity are shown in magenta: a picture must not hide them."""
 
@@ -34,19 +36,34 @@ def display_image(radiance: NDArray[np.float32], exposure: float) -> NDArray[np.
     Returns:
         [height, width, 3] sRGB in 8 bits, rounded to nearest; NaN and infinity in `NON_FINITE_COLOUR`.
     """
-    from models.metrics import tone_map
-
     if np.isfinite(radiance).all():  # by far the usual case, and several times faster
-        return _eight_bits(tone_map(radiance, exposure))
+        return _eight_bits(radiance, exposure)
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(radiance).all(axis=-1))
-    pixels = _eight_bits(tone_map(np.where(finite[..., None], radiance, 0).astype(np.float32), exposure))
+    pixels = _eight_bits(np.where(finite[..., None], radiance, 0).astype(np.float32), exposure)
     pixels[~finite] = NON_FINITE_COLOUR
     return pixels
 
 
-def _eight_bits(display: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """[0, 1] to 0..255, rounded to nearest."""
-    return (display * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)  # truncation is floor: none is negative
+def _eight_bits(radiance: NDArray[np.float32], exposure: float) -> NDArray[np.uint8]:
+    """`models.metrics.tone_map` in 8 bits, by a table of 16-bit linear values.
+
+    Rounded to nearest but for values within 0.03 of the middle between two levels. A table on one thread: the curve's
+    powers took 20 times as long beside a renderer that uses every core.
+    """
+    scale = np.float32(min(exposure * _TABLE_MAX, 1e38))
+    with np.errstate(over="ignore"):  # infinitely bright is white
+        linear = np.multiply(radiance, scale, dtype=np.float32)
+    np.clip(linear, 0.0, _TABLE_MAX, out=linear)
+    linear += np.float32(0.5)
+    return _display_table()[linear.astype(np.uint16)]
+
+
+@functools.cache
+def _display_table() -> NDArray[np.uint8]:
+    from models.metrics import tone_map
+
+    display = tone_map(np.arange(_TABLE_MAX + 1, dtype=np.float32) / np.float32(_TABLE_MAX), 1.0)
+    return np.rint(display * np.float32(255.0)).astype(np.uint8)
 
 
 def encode_pixels(pixels: NDArray[np.uint8], media_type: str = PNG) -> bytes:

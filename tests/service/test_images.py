@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from models.metrics import tone_map
 from service import images
 from service.errors import NotAcceptableError, OptionError
 from storage.frames import decode_frame
@@ -21,6 +22,18 @@ def srgb_8bit(linear: float) -> int:
 def test_display_image_is_the_srgb_curve_of_exposed_radiance(linear: float) -> None:
     radiance = np.full((2, 3, 3), linear / 4.0, np.float32)
     assert np.unique(images.display_image(radiance, 4.0)).tolist() == [srgb_8bit(linear)]
+
+
+def test_display_image_is_what_the_metrics_see_to_a_rounding() -> None:
+    radiance = np.geomspace(1e-6, 2.0, 300_000, dtype=np.float32).reshape(-1, 100, 3)
+    exact = tone_map(radiance, 0.8) * 255.0
+    assert np.abs(images.display_image(radiance, 0.8) - exact).max() < 0.53
+
+
+@pytest.mark.parametrize("exposure", [1e-30, 1.0, 1e37])
+def test_display_image_of_the_brightest_and_the_darkest_is_white_and_black(exposure: float) -> None:
+    radiance = np.array([[[0.0, 3e38, 1e-38 / exposure]]], np.float32)
+    assert images.display_image(radiance, exposure).tolist() == [[[0, 255, 0]]]
 
 
 def test_display_image_clips_to_the_screen() -> None:
