@@ -9,20 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from workers.backend import dr, mi
-from workers.direction_grids import MIN_AZIMUTH, MIN_POLAR
 from workers.elements import NO_SLOT, NOT_BAKED, ElementSet
 from workers.lobes import LobeClass, diffuse_reflectance, has, specular_tint
+from workers.query_directional import DirectionalLookup, four_channels, with_locators, xyz
 from workers.surfaces import SurfaceTable
-from workers.texels import (
-    EXPONENT_SHIFT,
-    FIELD_BITS,
-    FIELD_MASK,
-    TEXELS_PER_BLOCK,
-    DirectionalTexels,
-    exponent_bias,
-)
+from workers.texels import DirectionalTexels
 
-GRAZING_COSINE = 0.02
 STAND_IN_WEIGHT = 1e-4  # a stand-in counts only where no baked point does
 
 
@@ -77,18 +69,11 @@ class CacheShading:
             mi.UInt32(elements.diffuse_slot),
             mi.UInt32(elements.glossy_slot),
         )
-        self.diffuse = mi.Float(_four_channels(caches.diffuse))
-        texels = caches.texels
-        self.grid, self.packing, self.on_ladder = texels.grid, texels.packing, texels.rung is not None
-        if texels.packing is None:
-            self.directional = mi.Float(_four_channels(texels.values))
-        else:
-            self.directional = mi.UInt32(texels.values if len(texels.values) else np.zeros(1, np.uint32))
-        normals = _four_channels(elements.normal[elements.glossy])
-        if self.on_ladder and len(elements.glossy):  # the packet's fourth float tells where the slot's grid lies
-            normals.reshape(-1, 4)[:, 3] = texels.locators().view(np.float32)
-        self.glossy_normal = mi.Float(normals)
-        self.glossy_position = mi.Float(_four_channels(elements.position[elements.glossy]))
+        self.diffuse = mi.Float(four_channels(caches.diffuse))
+        self.directional = DirectionalLookup(caches.texels)
+        normals = four_channels(elements.normal[elements.glossy])
+        self.glossy_normal = mi.Float(with_locators(normals, caches.texels))
+        self.glossy_position = mi.Float(four_channels(elements.position[elements.glossy]))
         self.is_parametric = mi.UInt32(table.is_parametric.astype(np.uint32))
         self.has_diffuse = bool(np.any(elements.diffuse_slot != NO_SLOT))
         self.has_glossy = bool(np.any(elements.glossy_slot != NO_SLOT))
@@ -97,6 +82,7 @@ class CacheShading:
         """All device memory that a frozen program reads."""
         table = self.table
         arrays = tuple(value for value in vars(self).values() if dr.is_array_v(value))
+        arrays += (self.directional.texels,)
         return arrays, self.scene, table.index_of_registry, table.prim_offset_dr, table.lobe_bits_dr
 
     def shade(self, pi, si, active) -> Shaded:
@@ -208,8 +194,8 @@ class CacheShading:
                 packet = dr.gather(mi.Vector4f, self.glossy_normal, slot, active)
                 n = xyz(packet)
                 direction = 2 * dr.dot(mirrored, n) * n - mirrored if reflect else view
-                grid = self._grid(slot, packet.w)
-                value += self._bilinear(grid, mi.Frame3f(n).to_local(direction), active) * weight
+                local = mi.Frame3f(n).to_local(direction)
+                value += self.directional.bilinear(slot, packet.w, local, active) * weight
                 covered += dr.select(baked, weight, 0.0)
                 total += weight
             scale = dr.select(active, dr.rcp(dr.maximum(total, 1e-20)), 0.0)
@@ -223,53 +209,6 @@ class CacheShading:
         """(slot of a lattice point, whether it was baked there)."""
         raw = dr.gather(mi.UInt32, table, point, active)
         return raw & mi.UInt32(int(NOT_BAKED) - 1), (raw & mi.UInt32(int(NOT_BAKED))) == 0
-
-    def _grid(self, slot, locator):
-        """(first texel, azimuth, polar) of a slot's grid; see `DirectionalTexels.locators`."""
-        if not self.on_ladder:
-            azimuth, polar = self.grid
-            return slot * (azimuth * polar), mi.UInt32(azimuth), mi.UInt32(polar)
-        where = dr.reinterpret_array(mi.UInt32, locator)
-        rung = where & 7
-        return (where >> 3) * TEXELS_PER_BLOCK, mi.UInt32(MIN_AZIMUTH) << rung, mi.UInt32(MIN_POLAR) << rung
-
-    def _bilinear(self, grid, local, active):
-        """Bilinear lookup by polar angle and azimuth of one element's grid."""
-        first, azimuth, polar = grid
-        columns, rows = mi.Float(azimuth), mi.Float(polar)
-        cos_theta = dr.maximum(local.z, GRAZING_COSINE)
-        theta = dr.safe_acos(cos_theta) * (2 / dr.pi) * rows - 0.5
-        phi = dr.atan2(local.y, local.x) * dr.inv_two_pi * columns - 0.5
-        phi = dr.select(phi < 0, phi + columns, phi)
-        row = dr.clip(dr.floor(theta), 0.0, dr.maximum(rows - 2, 0.0))
-        column = dr.floor(phi)
-        ft, fp = dr.clip(theta - row, 0.0, 1.0), phi - column
-        r0 = mi.UInt32(row)
-        r1 = dr.minimum(r0 + 1, polar - 1)
-        c0 = self._wrapped(mi.UInt32(column), azimuth)
-        c1 = self._wrapped(c0 + 1, azimuth)
-        result = mi.Color3f(0)
-        for r, c, w in ((r0, c0, (1 - ft) * (1 - fp)), (r0, c1, (1 - ft) * fp), (r1, c0, ft * (1 - fp)),
-                        (r1, c1, ft * fp)):  # fmt: skip
-            result += self._texel(first + r * azimuth + c, w, active)
-        return result
-
-    def _wrapped(self, column, azimuth):
-        return column & (azimuth - 1) if self.on_ladder else column % azimuth
-
-    def _texel(self, index, weight, active):
-        """A texel of the directional cache times its weight; `texels.unpack` on the device."""
-        if self.packing is None:
-            return mi.Color3f(xyz(dr.gather(mi.Vector4f, self.directional, index, active))) * weight
-        packed = dr.gather(mi.UInt32, self.directional, index, active)
-        exponent = (packed >> EXPONENT_SHIFT) + exponent_bias(self.packing)
-        factor = dr.reinterpret_array(mi.Float, exponent << 23) * weight
-        fields = [packed, packed >> FIELD_BITS, packed >> 2 * FIELD_BITS]
-        if self.packing.signed:
-            above = 32 - FIELD_BITS
-            signed = [dr.reinterpret_array(mi.Int32, field << above) >> above for field in fields]
-            return mi.Color3f(*(mi.Float(value) for value in signed)) * factor
-        return mi.Color3f(*(mi.Float(mi.Int32(field & FIELD_MASK)) for field in fields)) * factor
 
 
 class _AskedOnce:
@@ -300,18 +239,6 @@ class _AskedOnce:
 
 def _interleaved(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.stack([first, second], 1).astype(np.uint32).reshape(-1)
-
-
-def _four_channels(values: np.ndarray) -> np.ndarray:
-    """[..., 3] as a flat array with four floats a row: one packet gather instead of three."""
-    rows = values.reshape(-1, 3)
-    padded = np.zeros((max(len(rows), 1), 4), np.float32)
-    padded[: len(rows), :3] = rows
-    return padded.reshape(-1)
-
-
-def xyz(value: "mi.Vector4f") -> "mi.Vector3f":
-    return mi.Vector3f(value.x, value.y, value.z)
 
 
 def _patch_cell(uv, m, square):
