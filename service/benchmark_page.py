@@ -5,6 +5,8 @@ from typing import Any
 
 from service import scores, trade
 from service.ablations import HEAD, LEGEND, ablation_cells
+from service.cost_curves import HEAD as CURVES_HEAD
+from service.cost_curves import exponent_cells, exponent_head, kind_title, remarks, row_cells, sentence
 from service.scores import human_bytes, human_seconds
 
 Record = Mapping[str, Any]
@@ -36,11 +38,14 @@ Every section names the command, commit and machine that gave it.
 """
 
 
-def render_page(records: Sequence[Record]) -> str:
-    """The whole page."""
-    if not records:
+def render_page(records: Sequence[Record], curves: Sequence[Record] = ()) -> str:
+    """The whole page: scenes, then cost curves."""
+    if not records and not curves:
         return f"{INTRODUCTION}\nNo scene has been measured yet.\n"
-    return "\n".join([INTRODUCTION, *_summary(records), *(_section(record) for record in records)])
+    lines = [INTRODUCTION]
+    if records:
+        lines += [*_summary(records), *(_section(record) for record in records)]
+    return "\n".join([*lines, *_cost_curves(curves)])
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
@@ -180,6 +185,26 @@ def _bake(bake: Mapping[str, Any]) -> list[str]:
         f"view, longest path {depth}; medians of {bake['repeats']} interleaved rounds, warm.", "",
         *table(("paths from", "M paths/s", "ratio", "paths a launch"), rows),
     ]  # fmt: skip
+
+
+def _cost_curves(curves: Sequence[Record]) -> list[str]:
+    if not curves:
+        return []
+    lines = ["## Cost curves", "", "Costs against the number of triangles, n, of one scene.", ""]
+    for record in curves:
+        result = record["result"]
+        shown = f"{result['width']}x{result['height']}, preset {result['preset']}; {result['triangles']:,} triangles "
+        shown += f"in the file; ours within {result['max_elements']:,} elements."
+        lines += [f"### {record['scene']}: costs", "", f"{shown} {sentence(result)}", ""]
+        lines += ["```sh", record["command"], "```", "", f"Commit {result['commit']}.", ""]
+        for kind in dict.fromkeys(row["kind"] for row in result["rows"]):
+            own = [row for row in result["rows"] if row["kind"] == kind]
+            head = [f"triangles, {kind_title(kind)}", *CURVES_HEAD[1:]]
+            lines += table(head, (row_cells(row) for row in own))
+        fits = result["exponents"]
+        lines += table(exponent_head(fits), exponent_cells(fits))
+        lines += [*(f"- {_cell(remark.removeprefix('note: '))}" for remark in remarks(result)), ""]
+    return lines
 
 
 def _ablation(record: Record) -> list[str]:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from service.ablations import measure_ablation
 from service.benchmark_page import render_page
+from service.cost_curves import load_curves
 from service.errors import ServiceError
 from service.options import write_file
 from service.outcome import json_values
@@ -195,7 +196,7 @@ def _read(store: "Store", file: str) -> Record | None:
 
 
 def write_page(store: "Store", output: Path) -> int:
-    """Writes the page of all records of a store; returns how many."""
+    """Writes the page of all records of a store, cost curves last; returns how many scenes were measured."""
     records = load_all(store)
-    write_file(output, render_page(records).encode())
+    write_file(output, render_page(records, load_curves(store)).encode())
     return len(records)

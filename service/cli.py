@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from service.batch_cli import batch_app, dataset
+from service.cost_curves_cli import cost_curves
 from service.export_cli import export
 from service.failures import reported
 from service.jobs_cli import jobs_app
@@ -205,7 +206,7 @@ def tradeoff(
     sizes: Annotated[
         list[str] | None, typer.Option("--size", help="WIDTHxHEIGHT that is timed too; may be given again")
     ] = None,
-    repeats: Annotated[int, typer.Option("--repeats", min=1, help="timed rounds; medians count")] = 3,
+    repeats: Annotated[int, typer.Option("--repeats", min=1, help="timed rounds; medians count")] = 5,
     paper: Annotated[bool, typer.Option("--paper/--no-paper", help="with the paper-exact configuration")] = True,
 ) -> None:
     """Measure error against time, bake and bytes over caches, query, network, precision and output scale.
@@ -368,6 +369,7 @@ def worker(
 
 app.command()(dataset)
 app.command()(export)
+app.command("cost-curves")(cost_curves)
 
 
 def main() -> None:

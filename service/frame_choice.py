@@ -10,6 +10,11 @@ if TYPE_CHECKING:
     from workers.renderer import Frame
 
 
+FRAME_STEPS = ("query", "network")
+"""What `max_ms` bounds: from a pose to the frame in memory. Waiting, opening a scene, what the first frame of a size or
+point needs ("prepare") and encoding are told apart in Server-Timing."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Demand:
     """What was asked for besides pose and size; None is "not given". Falsy where nothing was.
@@ -28,7 +33,9 @@ class Demand:
         return not (self.quality is None and self.max_ms is None and self.min_psnr is None)
 
 
-def choose_point(store: "Store", digest: str, demand: Demand, width: int, height: int) -> "Choice | None":
+def choose_point(
+    store: "Store", digest: str, demand: Demand, width: int, height: int, slowdown: float = 1.0
+) -> "Choice | None":
     """The measured point, or None where nothing is demanded: then the published run answers.
 
     Args:
@@ -36,6 +43,7 @@ def choose_point(store: "Store", digest: str, demand: Demand, width: int, height
         digest: of the scene.
         demand: what the frame must be.
         width, height: of the frame, pixels.
+        slowdown: how much longer than typical frames take here and now.
 
     Raises:
         OperatingPointError: the demand is none, or the table cannot be read.
@@ -50,7 +58,7 @@ def choose_point(store: "Store", digest: str, demand: Demand, width: int, height
     checked = FrameDemand(
         quality=cast("Quality | None", demand.quality), max_ms=demand.max_ms, min_psnr=demand.min_psnr
     )
-    return choose(load_table(store, digest).points, checked, width, height)
+    return choose(load_table(store, digest).points, checked, width, height, slowdown)
 
 
 def render_chosen(store: "Store", scene: str, camera: "Camera", demand: Demand) -> "tuple[Frame, Choice | None]":

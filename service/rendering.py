@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from service.catalogue import Catalogue, Entry
-from service.frame_choice import Demand, choose_point
+from service.frame_choice import FRAME_STEPS, Demand, choose_point
+from service.pace import Pace
 from service.scene_cache import DEFAULT_MEMORY_NBYTES, OpenScenes, Renderer, SceneKey
 
 if TYPE_CHECKING:
@@ -40,8 +41,9 @@ class Backend(Protocol):
         """Loads one scene, its caches and its network; takes seconds."""
         ...
 
-    def choose(self, digest: str, demand: Demand, width: int, height: int) -> "OperatingPoint":
-        """The measured point of a scene that meets a demand. Called on any thread."""
+    def choose(self, digest: str, demand: Demand, width: int, height: int, slowdown: float = 1.0) -> "OperatingPoint":
+        """The measured point of a scene that meets a demand where frames take `slowdown` times as long as measured.
+        Called on any thread."""
         ...
 
     def trim(self) -> None:
@@ -77,8 +79,8 @@ class StoreBackend:
 
         return PointRenderer.open(self._store, digest)
 
-    def choose(self, digest: str, demand: Demand, width: int, height: int) -> "OperatingPoint":
-        choice = choose_point(self._store, digest, demand, width, height)
+    def choose(self, digest: str, demand: Demand, width: int, height: int, slowdown: float = 1.0) -> "OperatingPoint":
+        choice = choose_point(self._store, digest, demand, width, height, slowdown)
         assert choice is not None  # something is demanded
         return choice.point
 
@@ -100,11 +102,16 @@ class FrameKey:
 
 @dataclass(frozen=True)
 class Rendered:
-    """A frame, and the seconds that it waited for the thread ("queue") and took to open its scene ("open"),
-    query and network."""
+    """A frame, and the seconds that it waited for the thread ("queue"), took to open its scene ("open") and to open or
+    compile what it is the first to need ("prepare"), query and network."""
 
     frame: "Frame"
     seconds: dict[str, float]
+
+    @property
+    def frame_s(self) -> float:
+        """Seconds from pose to frame in memory, which `max_ms` bounds."""
+        return sum(self.frame.seconds.get(step, 0.0) for step in FRAME_STEPS)
 
 
 class RenderThread:
@@ -124,6 +131,7 @@ class RenderThread:
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="lightwell-render")
         self._calls: set[Future[Any]] = set()
         self._backend: Backend | None = None
+        self.pace = Pace()
         self.catalogue = Catalogue(lambda: self._opened_backend().scenes())
         self.scenes = OpenScenes(
             lambda digest: self._opened_backend().open(digest),
@@ -154,11 +162,17 @@ class RenderThread:
         """
         if not demand:
             return None
-        return await asyncio.to_thread(self._opened_backend().choose, digest, demand, camera.width, camera.height)
+        slowdown = self.pace.slowdown(digest)
+        choose = self._opened_backend().choose
+        return await asyncio.to_thread(choose, digest, demand, camera.width, camera.height, slowdown)
 
     async def render(self, key: FrameKey) -> Rendered:
         """The frame of a key. Cancelled before the thread came to it, it is never begun."""
-        return await self._call(self._render, key, time.perf_counter())
+        rendered = await self._call(self._render, key, time.perf_counter())
+        if key.point is not None:
+            typical_ms = key.point.typical_ms(key.camera.width, key.camera.height)
+            self.pace.note(key.scene.digest, 1e3 * rendered.frame_s / typical_ms)
+        return rendered
 
     def close(self) -> None:
         """Waits for the frame in progress, drops those that wait."""
@@ -187,7 +201,11 @@ class RenderThread:
         seconds = {"queue": started_s - asked_s}
         if self.scenes.num_opened > num_opened:
             seconds["open"] = time.perf_counter() - started_s
-        frame = renderer.render(key.camera) if key.point is None else renderer.render(key.camera, key.point)
+        if key.point is None:
+            frame = renderer.render(key.camera)
+        else:
+            frame = renderer.render(key.camera, key.point)
+            self.scenes.restate(key.scene)
         return Rendered(frame, seconds | frame.seconds)
 
 

@@ -31,6 +31,10 @@ class Renderer(Protocol):
         """Memory that the open scene holds: caches, geometry, textures, network."""
         ...
 
+    def fit(self, nbytes: int) -> None:
+        """Drops what can be opened again until all is within `nbytes` or nothing more can go."""
+        ...
+
     def render(self, camera: "Camera", point: "OperatingPoint | None" = None) -> "Frame": ...
 
 
@@ -50,9 +54,9 @@ class SceneKey:
 class OpenScenes:
     """Renderers by scene and network, an LRU by bytes.
 
-    A scene's size is what its renderer says (`Renderer.nbytes`) once it is open. Where it is known from an
-    earlier opening, room is made before the scene is loaded; else the process holds the budget and the new scene
-    for a moment.
+    A scene's size is what its renderer says (`Renderer.nbytes`) once it is open, and again when it has opened parts
+    of operating points (`restate`). Where it is known from an earlier opening, room is made before the scene is
+    loaded; else the process holds the budget and the new scene, or the new parts, for a moment.
 
     Args:
         open_scene: loads a scene, by digest.
@@ -100,6 +104,22 @@ class OpenScenes:
         except Exception as error:
             self._failures[key] = error
             raise
+
+    def restate(self, key: SceneKey) -> None:
+        """Counts an open scene anew, for it may have grown: others are closed for it, and what exceeds the budget
+        even then it gives back itself."""
+        renderer = self._open.pop(key, None)
+        if renderer is None:
+            return
+        if renderer.nbytes > self.budget_nbytes:
+            renderer.fit(self.budget_nbytes)
+            self._trim()
+        if renderer.nbytes > self.budget_nbytes:
+            self.num_closed += 1
+            log.warning("closed scene %s: it has outgrown the memory limit", key.digest[:12])
+            return
+        self._make_room(renderer.nbytes)
+        self._open[key] = renderer
 
     def _load(self, key: SceneKey) -> Renderer:
         for other in [other for other in self._open if other.digest == key.digest]:

@@ -72,8 +72,16 @@ def remarks(result: Mapping[str, Any]) -> list[str]:
         f"{result['machine']}; median of {result['repeats']} interleaved rounds; mean of {result['num_frames']} test "
         f"frames; other processes kept {load['other_cpus']:.1f} of {load['cpus']:.0f} CPUs busy",
         f"the reference's own noise: {result['reference_error_db']:.2f} dB; rows above it cannot be told apart",
+        *_spread(result),
         *(f"note: {note}" for note in result["notes"]),
     ]
+
+
+def _spread(result: Mapping[str, Any]) -> list[str]:
+    if "spread" not in result:  # of an older table
+        return []
+    percent = 100 * result["spread"]
+    return [f"95 % of single frames take at most {percent:.0f} % more than their median; max_ms counts on that"]
 
 
 def write_tradeoff(table: Mapping[str, Any], json_file: Path | None, plot_file: Path | None) -> None:

@@ -27,11 +27,13 @@ _GEOMETRY = ("faces", "vertex_positions", "vertex_normals", "vertex_texcoords")
 
 def scene_nbytes(program: "QueryProgram", reconstructor: "Reconstructor") -> int:
     """Bytes of caches and lattice tables, geometry, textures, acceleration structure, network and programs."""
-    caches = _array_nbytes(program.shading.state()[0])
-    return (
-        caches + geometry_nbytes(program.table) + _parameter_nbytes(program.scene) + _network_nbytes(reconstructor)
-        + PROGRAM_NBYTES
-    )  # fmt: skip
+    geometry = geometry_nbytes(program.table) + _parameter_nbytes(program.scene)
+    return program_nbytes(program) + geometry + network_nbytes(reconstructor)
+
+
+def program_nbytes(program: "QueryProgram") -> int:
+    """Caches, lattice tables and recorded programs, without the scene that they belong to."""
+    return _array_nbytes(program.shading.state()[0]) + PROGRAM_NBYTES
 
 
 def geometry_nbytes(table: "SurfaceTable") -> int:
@@ -55,7 +57,7 @@ def _parameter_nbytes(mi_scene: "mi.Scene") -> int:
     return sum(_nbytes(value) for value in values)
 
 
-def _network_nbytes(reconstructor: "Reconstructor") -> int:
+def network_nbytes(reconstructor: "Reconstructor") -> int:
     """Twice the fp32 weights: at most one copy in another precision stands beside them."""
     with torch.device("meta"):
         network = FusionNet(reconstructor.config)

@@ -5,11 +5,16 @@ worth. `workers/operating_table.py` keeps the points of a scene.
 
 The time of a frame of p pixels is predicted as
 
-    ms(p) = (a + b p) (1 + m)
+    ms(p) = (a + b p) (1 + m) max(1 + s, d)
 
 with a, b >= 0 fitted to the measured medians in relative least squares, and the margin m the largest relative
-amount by which a measurement exceeds the fit. It says nothing of a size's first frame, whose program is compiled,
-of other machines, or of a machine that does other work meanwhile. PSNR is that of the run's own resolution.
+amount by which a median exceeds the fit. Frames smaller than the smallest measured size are taken to need its time:
+an intercept is the least certain part of a fit. The spread s is how far a single frame lies above the median in 95 %
+of the sweep's rounds. Another machine, or one that does other work meanwhile, is slower by a factor that the sweep
+cannot know: d, learned from the frames that a server makes (`service/pace.py`), 1 where nothing is known.
+
+It says nothing of a size's first frame, whose program is compiled: `workers/point_renderer.py` makes that
+frame twice, and calls the first one preparation. PSNR is that of the run's own resolution.
 """
 
 from collections.abc import Sequence
@@ -50,6 +55,8 @@ class OperatingPoint:
         times: at least one size.
         bake_seconds: of the caches alone, from their units' records.
         nbytes: caches and network at rest.
+        spread: relative excess of a single frame over the median that 95 % of them keep within; tables of before
+            it was measured have 0.
     """
 
     name: str
@@ -63,11 +70,22 @@ class OperatingPoint:
     times: tuple[FrameTime, ...]
     bake_seconds: float
     nbytes: int
+    spread: float = 0.0
 
-    def predicted_ms(self, width: int, height: int) -> float:
-        """Milliseconds of a frame by the model in this module's first lines."""
+    def typical_ms(self, width: int, height: int) -> float:
+        """Milliseconds of a median frame: (a + b p) (1 + m)."""
         fixed, per_pixel, margin = time_model(self.times)
-        return (fixed + per_pixel * width * height) * (1.0 + margin)
+        pixels = max(width * height, min(time.width * time.height for time in self.times))
+        return (fixed + per_pixel * pixels) * (1.0 + margin)
+
+    def predicted_ms(self, width: int, height: int, slowdown: float = 1.0) -> float:
+        """Milliseconds that nearly every frame keeps, by the model in this module's first lines.
+
+        Args:
+            width, height: of the frame, pixels.
+            slowdown: d, how much longer than typical frames take here and now.
+        """
+        return self.typical_ms(width, height) * max(1.0 + self.spread, slowdown)
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -140,10 +158,18 @@ class Choice:
     ms: float
 
 
-def choose(points: Sequence[OperatingPoint], demand: FrameDemand, width: int, height: int) -> Choice:
+def choose(
+    points: Sequence[OperatingPoint], demand: FrameDemand, width: int, height: int, slowdown: float = 1.0
+) -> Choice:
     """Picks the measured point for a frame.
 
     Without a quality, `max_ms` takes the highest PSNR that it allows, and `min_psnr` alone the fastest point.
+
+    Args:
+        points: of the scene.
+        demand: what the frame must be.
+        width, height: of the frame, pixels.
+        slowdown: as `OperatingPoint.predicted_ms`.
 
     Raises:
         NoOperatingPointsError: there are no points.
@@ -151,7 +177,7 @@ def choose(points: Sequence[OperatingPoint], demand: FrameDemand, width: int, he
     """
     if not points:
         raise NoOperatingPointsError("a scene must have a measured point to choose, got none; run: lightwell tradeoff")
-    every = [Choice(point, point.predicted_ms(width, height)) for point in points]
+    every = [Choice(point, point.predicted_ms(width, height, slowdown)) for point in points]
     max_ms = np.inf if demand.max_ms is None else demand.max_ms
     min_psnr = -np.inf if demand.min_psnr is None else demand.min_psnr
     admitted = [choice for choice in every if choice.ms <= max_ms and choice.point.psnr >= min_psnr]

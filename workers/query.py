@@ -68,6 +68,11 @@ class QueryProgram:
         self._program_unfrozen = program
         self._replay = dr.freeze(program, state_fn=lambda *_: self._state, limit=MAX_RECORDINGS, warn_after=1000)
 
+    @property
+    def num_recordings(self) -> int:
+        """How often a frame's program was traced and compiled; 0 where it cannot be recorded."""
+        return int(getattr(self._replay, "n_recordings", 0))
+
     def run(self, camera: Camera) -> np.ndarray:
         """Queries one frame.
 

@@ -33,7 +33,7 @@ class Frame:
 
     Attributes:
         radiance: linear scene radiance, float32 [height, width, 3].
-        seconds: wall seconds of "query" and "network".
+        seconds: wall seconds of "query" and "network"; of "prepare" where something was opened or compiled before.
         coverage: share of radiance lookups answered by baked elements, in [0, 1].
         exposure: the scene's exposure, to show the frame.
         non_finite: values that came NaN or infinite out of the query or the network. They are counted, reported and not
@@ -84,9 +84,17 @@ class FrameRenderer:
         return renderer
 
     @cached_property
-    def nbytes(self) -> int:
-        """Memory that the open scene holds, bytes (`workers/footprint.py`)."""
+    def run_nbytes(self) -> int:
+        """Memory of the scene, its caches and its network, bytes (`workers/footprint.py`)."""
         return scene_nbytes(self.program, self.reconstructor)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that the open scene holds, bytes; what is opened later counts from then on."""
+        return self.run_nbytes
+
+    def fit(self, nbytes: int) -> None:
+        """Drops what can be opened again until all is within `nbytes` or nothing more can go."""
 
     def render(self, camera: Camera) -> Frame:
         """Reconstructs the frame of a camera; any pose is answered."""

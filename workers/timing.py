@@ -5,8 +5,8 @@ machine hits all alike, and medians count. A first round, not counted, compiles 
 """
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 
 import numpy as np
 import psutil
@@ -21,7 +21,15 @@ MATMUL_REPEATS = 4
 def interleaved_medians(
     methods: dict[str, Callable[[int], object]], repeats: int, progress: Progress, description: str
 ) -> dict[str, float]:
-    """Median wall seconds of each method.
+    """Median wall seconds of each method; arguments as `interleaved_seconds`."""
+    rounds = interleaved_seconds(methods, repeats, progress, description)
+    return {name: float(np.median(values)) for name, values in rounds.items()}
+
+
+def interleaved_seconds(
+    methods: dict[str, Callable[[int], object]], repeats: int, progress: Progress, description: str
+) -> dict[str, list[float]]:
+    """Wall seconds of each method in every counted round.
 
     Args:
         methods: name to function of the round's index (0 is the round that is not counted); each must return
@@ -40,7 +48,28 @@ def interleaved_medians(
                 if index:
                     times[name].append(seconds)
             advance()
-    return {name: float(np.median(values)) for name, values in times.items()}
+    return times
+
+
+def spread_of(rounds: Iterable[Sequence[float]], share: float = 0.95) -> float:
+    """How far above the median of the other rounds one round lies, at most, in `share` of the cases.
+
+    Rounds of several methods are pooled: few repeats of one tell nothing of its tail.
+
+    Args:
+        rounds: seconds of each method; those with fewer than two rounds are left out.
+        share: quantile, in (0, 1).
+
+    Returns:
+        Relative excess, >= 0; 0 where there is nothing to tell it from.
+    """
+    ratios = [
+        seconds / np.median([*values[:index], *values[index + 1 :]])
+        for values in rounds
+        if len(values) > 1
+        for index, seconds in enumerate(values)
+    ]
+    return max(0.0, float(np.quantile(ratios, share)) - 1.0) if ratios else 0.0
 
 
 @contextmanager
@@ -48,16 +77,25 @@ def other_load() -> Iterator[dict[str, float]]:
     """Measures what else ran meanwhile: times taken on a busy machine are too long.
 
     Yields:
-        A dict that holds "other_cpus" (mean number of CPU threads that other processes kept busy) and "cpus"
-        once the block has ended.
+        A dict that holds "other_cpus" (mean number of CPU threads that others than this process and its children
+        kept busy) and "cpus" once the block has ended.
     """
     load: dict[str, float] = {}
     own = psutil.Process()
-    busy, mine, wall = _busy_seconds(psutil.cpu_times()), sum(own.cpu_times()[:2]), time.perf_counter()
+    busy, mine, wall = _busy_seconds(psutil.cpu_times()), _family_seconds(own), time.perf_counter()
     yield load
     elapsed = max(time.perf_counter() - wall, 1e-9)
-    others = _busy_seconds(psutil.cpu_times()) - busy - (sum(own.cpu_times()[:2]) - mine)
+    others = _busy_seconds(psutil.cpu_times()) - busy - (_family_seconds(own) - mine)
     load |= {"other_cpus": max(others, 0.0) / elapsed, "cpus": float(psutil.cpu_count() or 1)}
+
+
+def _family_seconds(process: psutil.Process) -> float:
+    """CPU seconds of a process, of its children that live, and of those that ended."""
+    seconds = sum(process.cpu_times()[:4])  # user, system, and the same of ended children
+    for child in process.children():
+        with suppress(psutil.NoSuchProcess):
+            seconds += _family_seconds(child)
+    return seconds
 
 
 def _busy_seconds(times: object) -> float:

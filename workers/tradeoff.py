@@ -28,7 +28,7 @@ from workers.evaluate import (
 from workers.operating_points import FrameTime, OperatingPoint
 from workers.operating_table import OperatingTable, save_table
 from workers.pareto import pareto_front
-from workers.point_renderer import derived_run
+from workers.point_parts import derived_run
 from workers.progress import Progress
 from workers.reconstruct import Reconstructor
 from workers.render import run_render
@@ -36,7 +36,7 @@ from workers.renderer import FrameRenderer, publish
 from workers.run_state import RunState
 from workers.scene import Scene
 from workers.settings import Settings
-from workers.timing import interleaved_medians, other_load
+from workers.timing import interleaved_seconds, other_load, spread_of
 from workers.tradeoff_preparation import PreparedVariant, base_run, network_ref, prepare_variants
 from workers.tradeoff_variants import TradeoffBudget
 from workers.train import load_network
@@ -71,8 +71,8 @@ def run_tradeoff(
     methods = _methods(base, renderer, prepared, budget)
     rows = _score(base, renderer, methods, reference)
     with other_load() as load:
-        times = _times(base, prepared, methods, budget)
-    table = _table(base, budget, prepared, rows, times, reference, load)
+        times, spread = _times(base, prepared, methods, budget)
+    table = _table(base, budget, prepared, rows, times, spread, reference, load)
     save_table(store, scene.digest, table)
     if known is None or "network" not in known:
         publish(base, network_ref(base, network_key), rows[0]["psnr"])
@@ -113,8 +113,9 @@ Times = dict[str, dict[tuple[int, int], float]]
 
 def _times(
     base: RunState, prepared: list[PreparedVariant], methods: dict[str, Method], budget: TradeoffBudget
-) -> Times:
-    """Median milliseconds by row and size: all rows at the run's own size, ours at the others too.
+) -> tuple[Times, float]:
+    """Median milliseconds by row and size: all rows at the run's own size, ours at the others too; and the spread of
+    single frames of ours (`spread_of`).
 
     All of them in the same rounds: a slow minute must not bend the line through a point's sizes.
     """
@@ -131,10 +132,12 @@ def _times(
                 method(cameras[index % len(cameras)], index)
             )
     times: Times = {name: {} for name in methods}
-    for call, seconds in interleaved_medians(calls, budget.repeats, base.progress, "time frames").items():
+    rounds = interleaved_seconds(calls, budget.repeats, base.progress, "time frames")
+    for call, seconds in rounds.items():
         name, size = places[call]
-        times[name][size] = 1e3 * seconds
-    return times
+        times[name][size] = 1e3 * float(np.median(seconds))
+    own_names = {one.variant.name for one in prepared}
+    return times, spread_of(seconds for call, seconds in rounds.items() if places[call][0] in own_names)
 
 
 # -------------------------------------------------- the table --------------------------------------------------
@@ -142,7 +145,7 @@ def _times(
 
 def _table(
     base: RunState, budget: TradeoffBudget, prepared: list[PreparedVariant], rows: list[dict[str, Any]], times: Times,
-    reference: Reference, load: dict[str, float],
+    spread: float, reference: Reference, load: dict[str, float],
 ) -> OperatingTable:  # fmt: skip
     own = (base.settings.width, base.settings.height)
     made = {one.variant.name: one for one in prepared}
@@ -156,25 +159,27 @@ def _table(
             row |= {key: prepared[0].costs[key] for key in ("bake_seconds", "bake_paths")}
             row["nbytes"] = made["no network"].costs["nbytes"] if "no network" in made else prepared[0].costs["nbytes"]
     mark_fronts(rows)
-    points = [_point(made[row["name"]], row) for row in rows if row["kind"] == "ours" and row["psnr"] is not None]
-    refused = [row["name"] for row in rows if row["kind"] == "ours" and row["psnr"] is None]
+    ours = [row for row in rows if row["kind"] == "ours"]
+    points = [_point(made[row["name"]], row, spread) for row in ours if row["psnr"] is not None]
+    refused = [row["name"] for row in ours if row["psnr"] is None]
     settings = base.settings
     result = {
         "scene": base.scene.name, "digest": base.scene.digest, "width": own[0], "height": own[1], "rows": rows,
         "preset": settings.preset, "exposure": prepared[0].exposure, "reference_error_db": reference.error_db,
         "reference_denoised": reference.denoised, "num_frames": len(base.paths.test), "repeats": budget.repeats,
-        "network_seconds": budget.network_seconds, "machine": machine(), "commit": commit(), "load": load,
-        "notes": _notes(budget, refused, reference),
+        "spread": spread, "network_seconds": budget.network_seconds, "machine": machine(), "commit": commit(),
+        "load": load, "notes": _notes(budget, refused, reference),
     }  # fmt: skip
     return OperatingTable(base=plain(settings.to_json(), "settings"), points=tuple(points), result=result)
 
 
-def _point(one: PreparedVariant, row: dict[str, Any]) -> OperatingPoint:
+def _point(one: PreparedVariant, row: dict[str, Any], spread: float) -> OperatingPoint:
     times = tuple(FrameTime(**time) for time in row["times"])
     return OperatingPoint(
         name=row["name"], overrides=plain(one.variant.overrides, "overrides"), network=one.network,
         precision=one.precision, scale=one.variant.scale, psnr=row["psnr"], flip=row["flip"],
         temporal=row["temporal"], times=times, bake_seconds=row["bake_seconds"], nbytes=row["nbytes"],
+        spread=spread,
     )  # fmt: skip
 
 

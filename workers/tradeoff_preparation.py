@@ -9,7 +9,7 @@ from storage.store import UnitRef
 from workers.ablation import bake_cost
 from workers.camera import Camera
 from workers.element_stage import run_elements
-from workers.point_renderer import PointParts, Reconstruct, derived_run
+from workers.point_parts import PointParts, Reconstruct, derived_run
 from workers.query import QueryProgram
 from workers.reconstruct import Reconstructor
 from workers.renderer import make_frame

@@ -25,15 +25,16 @@ class TradeoffBudget:
     Attributes:
         network_seconds: training of each network, at most; the run's own network is taken as it is where the
             store has it.
-        sizes: (width, height) at which our points are timed besides the run's own size, pixels.
-        repeats: timed rounds; medians count.
+        sizes: (width, height) at which our points are timed besides the run's own size, pixels; the smallest and the
+            largest bound what `max_ms` can be promised for.
+        repeats: timed rounds; medians count, and what single rounds stray from them is the points' spread.
         spp: path-traced rows.
         paper: also bake and train the paper-exact configuration.
     """
 
     network_seconds: float = 60.0
-    sizes: tuple[tuple[int, int], ...] = ((320, 180), (1280, 720))
-    repeats: int = 3
+    sizes: tuple[tuple[int, int], ...] = ((128, 72), (320, 180), (1280, 720))
+    repeats: int = 5
     spp: tuple[int, ...] = (1, 2, 4, 8, 16)
     paper: bool = True
 

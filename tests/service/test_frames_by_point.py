@@ -28,9 +28,9 @@ def client(backend: Any) -> Iterator[TestClient]:
     rendered: list[Any] = []
     render = backend.render
 
-    def choose_among(digest: str, demand: Demand, width: int, height: int) -> OperatingPoint:
+    def choose_among(digest: str, demand: Demand, width: int, height: int, slowdown: float = 1.0) -> OperatingPoint:
         wanted: dict[str, Any] = vars(demand)
-        return choose(points, FrameDemand(**wanted), width, height).point
+        return choose(points, FrameDemand(**wanted), width, height, slowdown).point
 
     def render_point(camera: Any, point: OperatingPoint | None = None) -> Any:
         rendered.append(point and point.name)

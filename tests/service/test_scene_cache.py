@@ -3,6 +3,8 @@
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from service.errors import SceneTooLargeError
 from service.scene_cache import OpenScenes, SceneKey
@@ -97,3 +99,74 @@ def test_a_scene_that_cannot_be_opened_is_not_tried_again_at_once() -> None:
     assert loader.opened == ["a"]
     loader.failure, clock = None, 6.0
     assert scenes.get(key("a")).nbytes == 10
+
+
+class Growing:
+    """A scene whose operating points take memory as they are opened."""
+
+    def __init__(self, own: int) -> None:
+        self.own, self.points = own, 0
+
+    @property
+    def nbytes(self) -> int:
+        return self.own + self.points
+
+    def fit(self, nbytes: int) -> None:
+        self.points = max(0, min(self.points, nbytes - self.own))
+
+
+def growing(budget_nbytes: int, **own: int) -> tuple[OpenScenes, dict[str, Growing], list[int]]:
+    made = {digest: Growing(nbytes) for digest, nbytes in own.items()}
+    trims: list[int] = []
+    load: Any = made.__getitem__
+    return OpenScenes(load, budget_nbytes=budget_nbytes, trim=lambda: trims.append(1)), made, trims
+
+
+def test_a_scene_that_grew_is_counted_anew_and_closes_others() -> None:
+    scenes, made, trims = growing(100, a=40, b=40)
+    scenes.get(key("a"))
+    scenes.get(key("b"))
+    made["b"].points = 15
+    scenes.restate(key("b"))
+    assert scenes.nbytes == 95 and len(scenes) == 2 and scenes.num_closed == 0
+    made["b"].points = 50
+    scenes.restate(key("b"))
+    assert scenes.nbytes == 90 and len(scenes) == 1 and scenes.num_closed == 1 and trims
+    assert scenes.get(key("b")) is made["b"]
+
+
+def test_a_scene_that_outgrows_the_budget_gives_its_points_back() -> None:
+    scenes, made, trims = growing(100, a=40, b=40)
+    scenes.get(key("a"))
+    scenes.get(key("b"))
+    made["b"].points = 500
+    scenes.restate(key("b"))
+    assert made["b"].nbytes == 100 == scenes.nbytes and len(scenes) == 1 and trims
+
+
+def test_a_scene_that_cannot_shrink_is_closed() -> None:
+    scenes, made, _ = growing(100, a=40)
+    scenes.get(key("a"))
+    made["a"].own = 101
+    scenes.restate(key("a"))
+    assert len(scenes) == 0 and scenes.nbytes == 0 and scenes.num_closed == 1
+
+
+def test_a_scene_that_is_not_open_is_not_counted() -> None:
+    scenes, _, _ = growing(100, a=40)
+    scenes.restate(key("a"))
+    assert len(scenes) == 0
+
+
+@given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 300)), max_size=30))
+def test_open_scenes_never_exceed_the_budget(uses: list[tuple[str, int]]) -> None:
+    scenes, made, _ = growing(100, a=30, b=60, c=100)
+    for digest, points in uses:
+        scenes.get(key(digest))
+        made[digest].points = points
+        scenes.restate(key(digest))
+        held = sum(made[name].nbytes for name in "abc" if key(name) in scenes._open)
+        assert scenes.nbytes == held <= 100
+        for name in "abc":
+            if key(name) not in scenes._open:
+                made[name].points = 0

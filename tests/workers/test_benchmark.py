@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 import torch
 
@@ -98,20 +99,30 @@ def test_matmul_rate_counts_a_multiply_add_as_two(monkeypatch: pytest.MonkeyPatc
     assert rate == pytest.approx(2 * 8**3 / 1e9)
 
 
-def test_other_load_is_what_is_busy_beside_this_process(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_load_is_what_is_busy_beside_this_process_and_its_children(
+    clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
     machine = SimpleNamespace(user=100.0, system=10.0, idle=0.0)
     own = SimpleNamespace(seconds=(5.0, 1.0, 0.0, 0.0))
+    started: list[SimpleNamespace] = []
     fake = SimpleNamespace(
-        Process=lambda: SimpleNamespace(cpu_times=lambda: own.seconds),
+        Process=lambda: SimpleNamespace(cpu_times=lambda: own.seconds, children=lambda: started),
+        NoSuchProcess=psutil.NoSuchProcess,
         cpu_times=lambda: machine,
         cpu_count=lambda: 4,
     )
+
+    def ended() -> None:
+        raise psutil.NoSuchProcess(1)
+
     monkeypatch.setattr(timing, "psutil", fake)
     with timing.other_load() as load:
         clock.now += 10.0
         machine.user, machine.system, machine.idle = 130.0, 15.0, 5.0  # 35 s busy
-        own.seconds = (13.0, 3.0, 0.0, 0.0)  # 10 s of them ours
-    assert load == {"other_cpus": 2.5, "cpus": 4.0}
+        own.seconds = (13.0, 3.0, 2.0, 0.0)  # 12 s of them ours, 2 s of those of a child that ended
+        started.append(SimpleNamespace(cpu_times=lambda: (2.5, 0.5, 0.0, 0.0), children=list))
+        started.append(SimpleNamespace(cpu_times=ended))
+    assert load == {"other_cpus": 2.0, "cpus": 4.0}
 
 
 # ------------------------------------------------ one frame ------------------------------------------------
@@ -213,3 +224,15 @@ def test_bake_throughput_of_exitant_caches_has_no_diffuse_lobe(run: RunState) ->
     cache = exitant.settings.cache
     assert set(result["ratios"]) == {"directional"}
     assert result["paths"]["directional"] % (cache.azimuth * cache.polar * cache.directional_spp) == 0
+
+
+def test_spread_is_what_single_rounds_stray_from_the_others() -> None:
+    rng = np.random.default_rng(1)
+    rounds = [list(base * np.exp(rng.normal(0, 0.1, 200))) for base in (1.0, 50.0)]
+    assert timing.spread_of(rounds) == pytest.approx(np.exp(1.645 * 0.1) - 1, abs=0.03)  # the normal's 95 % quantile
+    assert timing.spread_of([[2.0, 2.0, 2.0]]) == 0.0
+    assert timing.spread_of([[1.0, 3.0]], share=0.999) == pytest.approx(2.0, rel=0.01)
+
+
+def test_spread_of_single_rounds_is_not_known() -> None:
+    assert timing.spread_of([[1.0], [7.0]]) == 0.0

@@ -56,6 +56,27 @@ def test_prediction_is_nowhere_below_a_measurement(measured: list[tuple[int, flo
     assert all(one.predicted_ms(t.width, t.height) >= t.ms * (1 - 1e-9) for t in given_times)
 
 
+def test_prediction_covers_the_spread_and_the_slowdown() -> None:
+    spread = point("any", 30.0, 10.0, spread=0.2)
+    typical = spread.typical_ms(640, 360)
+    assert typical == pytest.approx(1.0 + 10.0 * 640 * 360 / 1e6)
+    assert spread.predicted_ms(640, 360) == pytest.approx(1.2 * typical)
+    assert spread.predicted_ms(640, 360, 1.1) == pytest.approx(1.2 * typical)  # the spread already holds it
+    assert spread.predicted_ms(640, 360, 1.5) == pytest.approx(1.5 * typical)
+
+
+def test_prediction_below_the_smallest_measured_size_is_that_size_s() -> None:
+    smallest = SIZES[0]
+    assert POINTS[0].predicted_ms(8, 8) == POINTS[0].predicted_ms(*smallest)
+    assert POINTS[0].predicted_ms(8, 8) < POINTS[0].predicted_ms(*SIZES[1])
+
+
+def test_points_of_older_tables_have_no_spread() -> None:
+    value = POINTS[0].to_json()
+    del value["spread"]
+    assert OperatingPoint.from_json(value).spread == 0.0
+
+
 # ------------------------------------------------- the choice -------------------------------------------------
 
 
@@ -83,6 +104,13 @@ def test_choose_knows_the_size() -> None:
     assert choose(POINTS, demand, 1000, 1000).point.name == "middle"
     assert choose(POINTS, demand, 400, 400).point.name == "finest"
     assert choose(POINTS, demand, 400, 400).ms == pytest.approx(33.0)
+
+
+def test_choose_takes_a_faster_point_where_frames_are_slow() -> None:
+    demand = FrameDemand(max_ms=45.0)
+    assert [choose(POINTS, demand, 1000, 1000, slowdown).point.name for slowdown in (1.0, 1.2)] == ["middle", "fast"]
+    with pytest.raises(UnreachableTargetError, match=r"in 55\.0 ms"):
+        choose(POINTS, demand, 1000, 1000, 5.0)
 
 
 @pytest.mark.parametrize(
