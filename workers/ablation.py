@@ -12,6 +12,7 @@ from models.metrics import exposure_from_luminance, luminance, score_frame
 from storage.caches import CacheSet
 from storage.store import Store, UnitRef
 from workers.bake import bake_refs, cache_nbytes, load_caches, run_bake
+from workers.direction_grids import directional_cost
 from workers.element_stage import run_elements
 from workers.elements import ElementSet
 from workers.evaluate import load_reference, mean_score
@@ -114,7 +115,7 @@ def training_exposure(run: RunState, refs: list[UnitRef]) -> float:
 def bake_cost(run: RunState, elements: ElementSet) -> dict[str, float]:
     cache = run.settings.cache
     diffuse = elements.num_elements * cache.diffuse_spp if cache.lobes == "split" else 0
-    directional = len(elements.glossy) * cache.azimuth * cache.polar * cache.directional_spp
+    directional = directional_cost(elements, cache)["paths"]
     seconds = 0.0
     for ref in bake_refs(run, elements).values():
         caches = CacheSet.open(run.store, ref)

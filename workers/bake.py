@@ -6,92 +6,44 @@ into launches only for speed: a unit's bytes do not depend on its company.
 
 import dataclasses
 import time
-from collections.abc import Callable
 
 import numpy as np
 
-from storage.caches import ArraySpec, CacheSet
+from storage.caches import CacheSet
 from storage.store import UnitRef
-from workers.bake_kernels import Batch, bake_diffuse, bake_directional
+from workers.bake_kernels import Batch
+from workers.bake_lobes import DIFFUSE, Lobe, lobes_of
 from workers.cache_filter import filter_diffuse, filter_directional
-from workers.element_stage import elements_ref
+from workers.direction_grids import choose_grids
 from workers.elements import ElementSet
 from workers.errors import QuarantinedError
 from workers.lobes import reflectance_at
 from workers.query import CacheArrays
 from workers.run_state import RunState
-from workers.transport import TRANSPORT_VERSION
+from workers.texels import DirectionalTexels, Packing, unpack_rows
 
 STAGE = "bake"
 LANES_PER_LAUNCH = 1 << 21
 MAX_NON_FINITE_SHARE = 1e-4
 
 
-@dataclasses.dataclass(frozen=True)
-class _Lobe:
-    """One lobe to bake: its cache set's specification and its kernel."""
-
-    name: str
-    params: dict
-    arrays: dict[str, tuple[int, ...]]
-    owners: np.ndarray  # element of each row
-    lanes_per_element: int
-    kernel: Callable[[Batch, int], dict[str, np.ndarray]]
-
-
-def _lobes(run: RunState, elements: ElementSet) -> list[_Lobe]:
-    """What there is to bake; a lobe without elements is left out."""
-    cache = run.settings.cache
-    scene, table, depth = run.scene.mi_scene, run.table, run.scene.max_depth
-    common = {"elements": elements_ref(run).key, "max_depth": depth, "passes": cache.passes,
-              "elements_per_unit": cache.elements_per_unit, "transport": TRANSPORT_VERSION}  # fmt: skip
-    grid = (cache.azimuth, cache.polar)
-    diffuse_spp = _per_pass(cache.diffuse_spp, cache.passes)
-    directional_spp = _per_pass(cache.directional_spp, cache.passes)
-
-    def diffuse(batch: Batch, index: int) -> dict[str, np.ndarray]:
-        mean, square = bake_diffuse(scene, table, elements, batch, diffuse_spp, index, depth)
-        return {"mean": mean, "square": square}
-
-    def directional(batch: Batch, index: int) -> dict[str, np.ndarray]:
-        exitant = cache.lobes == "exitant"
-        return {"mean": bake_directional(scene, table, elements, batch, grid, directional_spp, index, depth, exitant)}
-
-    lobes = []
-    if cache.lobes == "split" and elements.num_elements:
-        params = common | {"lobe": "diffuse", "spp": cache.diffuse_spp}
-        owners = np.arange(elements.num_elements)
-        arrays: dict[str, tuple[int, ...]] = {"mean": (3,), "square": (3,)}
-        lobes.append(_Lobe("diffuse", params, arrays, owners, diffuse_spp, diffuse))
-    if len(elements.glossy):
-        params = common | {"lobe": cache.lobes, "grid": grid, "spp": cache.directional_spp}
-        lanes = grid[0] * grid[1] * directional_spp
-        arrays = {"mean": (grid[1], grid[0], 3)}
-        lobes.append(_Lobe("directional", params, arrays, elements.glossy, lanes, directional))
-    return lobes
-
-
-def _per_pass(spp: int, passes: int) -> int:
-    return max(1, -(-spp // passes))
-
-
 def bake_refs(run: RunState, elements: ElementSet) -> dict[str, UnitRef]:
     """Cache sets of a run by lobe."""
-    return {lobe.name: run.ref(STAGE, lobe.params) for lobe in _lobes(run, elements)}
+    return {lobe.name: run.ref(STAGE, lobe.params) for lobe in lobes_of(run, elements)}
 
 
 def run_bake(run: RunState, elements: ElementSet) -> dict[str, UnitRef]:
     """Bakes whatever units the store lacks.
 
     Returns:
-        Cache set of each lobe ("diffuse", "directional").
+        Cache set of each lobe, by its name.
 
     Raises:
         QuarantinedError: a unit holds more non-finite values than a few stray samples; it was set aside.
     """
     start = time.perf_counter()
     refs = {}
-    for lobe in _lobes(run, elements):
+    for lobe in lobes_of(run, elements):
         refs[lobe.name] = run.ref(STAGE, lobe.params)
         if run.store.committed(refs[lobe.name]) is None:
             caches = _cache_set(run, lobe)
@@ -122,7 +74,7 @@ def bake_sets(run: RunState, elements: ElementSet) -> dict[str, BakeSet]:
     return {
         lobe.name: BakeSet(run.ref(STAGE, lobe.params), -(-len(lobe.owners) // per_unit),
                            lobe.lanes_per_element * per_unit * passes)
-        for lobe in _lobes(run, elements)
+        for lobe in lobes_of(run, elements)
     }  # fmt: skip
 
 
@@ -150,18 +102,16 @@ def seal_bake(run: RunState, elements: ElementSet, lobe_name: str) -> UnitRef:
     return caches.ref
 
 
-def _lobe(run: RunState, elements: ElementSet, name: str) -> _Lobe:
-    return next(lobe for lobe in _lobes(run, elements) if lobe.name == name)
+def _lobe(run: RunState, elements: ElementSet, name: str) -> Lobe:
+    return next(lobe for lobe in lobes_of(run, elements) if lobe.name == name)
 
 
-def _cache_set(run: RunState, lobe: _Lobe) -> CacheSet:
-    per_unit, rows = run.settings.cache.elements_per_unit, len(lobe.owners)
-    specs = [ArraySpec(name, (rows, *shape), "float32", per_unit) for name, shape in lobe.arrays.items()]
-    ref = run.ref(STAGE, lobe.params)
-    return CacheSet.create_or_open(run.store, ref, specs, {"lobe": lobe.name, **lobe.params})
+def _cache_set(run: RunState, lobe: Lobe) -> CacheSet:
+    specs = lobe.array_specs(run.settings.cache.elements_per_unit)
+    return CacheSet.create_or_open(run.store, run.ref(STAGE, lobe.params), specs, lobe.attributes())
 
 
-def _bake_missing(run: RunState, lobe: _Lobe, caches: CacheSet, missing: list[int]) -> None:
+def _bake_missing(run: RunState, lobe: Lobe, caches: CacheSet, missing: list[int]) -> None:
     per_unit = run.settings.cache.elements_per_unit
     per_launch = max(1, LANES_PER_LAUNCH // (lobe.lanes_per_element * per_unit))
     with run.progress.track(f"bake {lobe.name}", len(missing)) as advance:
@@ -171,11 +121,11 @@ def _bake_missing(run: RunState, lobe: _Lobe, caches: CacheSet, missing: list[in
             advance(len(units))
 
 
-def _seal(run: RunState, lobe: _Lobe, caches: CacheSet) -> None:
+def _seal(run: RunState, lobe: Lobe, caches: CacheSet) -> None:
     caches.commit({"params": lobe.params, "passes": run.settings.cache.passes})
 
 
-def _bake_units(run: RunState, lobe: _Lobe, caches: CacheSet, units: list[int], per_unit: int) -> None:
+def _bake_units(run: RunState, lobe: Lobe, caches: CacheSet, units: list[int], per_unit: int) -> None:
     start = time.perf_counter()
     ranges = [np.arange(u * per_unit, min((u + 1) * per_unit, len(lobe.owners))) for u in units]
     seeds = [np.full(len(r), caches.unit_seed(u), np.uint64) for u, r in zip(units, ranges, strict=True)]
@@ -200,7 +150,7 @@ def _bake_units(run: RunState, lobe: _Lobe, caches: CacheSet, units: list[int], 
             caches.quarantine_unit(unit, str(error), error.facts)
             refused.append(error)
         else:
-            caches.write_unit(unit, rows, {"seconds": seconds, "health": health})
+            caches.write_unit(unit, lobe.at_rest(rows), {"seconds": seconds, "health": health})
     if refused:  # once the others are kept
         raise QuarantinedError(f"{refused[0]} (units set aside: {len(refused)})", refused[0].facts)
 
@@ -228,21 +178,52 @@ def load_caches(run: RunState, elements: ElementSet) -> CacheArrays:
         StorageError: a unit is missing or damaged.
     """
     cache = run.settings.cache
-    refs = bake_refs(run, elements)
-    loaded = {name: CacheSet.open(run.store, ref).load() for name, ref in refs.items()}
-    diffuse = loaded["diffuse"]["mean"] if "diffuse" in loaded else np.zeros((0, 3), np.float32)
-    empty = np.zeros((0, cache.polar, cache.azimuth, 3), np.float32)
-    directional = loaded["directional"]["mean"] if "directional" in loaded else empty
-    exitant = cache.lobes == "exitant"
-    if cache.denoise and not exitant:
-        directional = filter_directional(elements, directional)
-        if "diffuse" in loaded:
-            square = loaded["diffuse"]["square"].astype(np.float64)
-            variance = np.maximum(square - diffuse.astype(np.float64) ** 2, 0.0) / max(cache.diffuse_spp - 1, 1)
-            diffuse = filter_diffuse(elements, diffuse, np.sqrt(variance))
-    if not cache.demodulate and not exitant:
-        diffuse = diffuse * reflectance_at(run.table, elements)
-    return CacheArrays(diffuse, directional, demodulated=cache.demodulate, exitant=exitant)
+    lobes = {lobe.name: lobe for lobe in lobes_of(run, elements)}
+    diffuse = np.zeros((0, 3), np.float32)
+    if DIFFUSE in lobes:
+        diffuse = _load_diffuse(run, elements, _stored(run, lobes.pop(DIFFUSE)).load())
+    directional = _load_directional(run, elements, list(lobes.values()))
+    return CacheArrays(diffuse, directional, demodulated=cache.demodulate, exitant=cache.lobes == "exitant")
+
+
+def _stored(run: RunState, lobe: Lobe) -> CacheSet:
+    return CacheSet.open(run.store, run.ref(STAGE, lobe.params))
+
+
+def _load_diffuse(run: RunState, elements: ElementSet, loaded: dict[str, np.ndarray]) -> np.ndarray:
+    cache, diffuse = run.settings.cache, loaded["mean"]
+    if cache.denoise:
+        square = loaded["square"].astype(np.float64)
+        variance = np.maximum(square - diffuse.astype(np.float64) ** 2, 0.0) / max(cache.diffuse_spp - 1, 1)
+        diffuse = filter_diffuse(elements, diffuse, np.sqrt(variance))
+    return diffuse if cache.demodulate else diffuse * reflectance_at(run.table, elements)
+
+
+def _load_directional(run: RunState, elements: ElementSet, lobes: list[Lobe]) -> DirectionalTexels:
+    """All grids in one buffer. Packed ones are read, filtered and packed again grid by grid: the floats of one grid
+    are the most that is held beside the buffer."""
+    cache = run.settings.cache
+    if not lobes:
+        return DirectionalTexels.uniform(np.zeros((0, cache.polar, cache.azimuth, 3), np.float32))
+    at_rest = [_stored(run, lobe).load() for lobe in lobes]
+    packing = None
+    if lobes[0].signed is not None:
+        top = max(int(arrays["top"].max()) for arrays in at_rest)  # a filtered value is never above what it averages
+        packing = Packing(top, any(lobe.signed for lobe in lobes))
+
+    def load(index: int) -> np.ndarray:
+        lobe, arrays = lobes[index], at_rest[index]
+        at_rest[index] = {}
+        grids = arrays["mean"] if lobe.signed is None else unpack_rows(**arrays, signed=lobe.signed)
+        if not cache.denoise or cache.lobes == "exitant":
+            return grids
+        return filter_directional(elements, grids, lobe.slots)
+
+    rungs = choose_grids(elements.spread, cache)
+    if rungs is None:
+        return DirectionalTexels.uniform(load(0), packing)
+    order = np.unique(rungs).tolist()  # as the lobes are
+    return DirectionalTexels.ladder(rungs, lambda rung: load(order.index(rung)), packing)
 
 
 def cache_nbytes(run: RunState, elements: ElementSet) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 
 from workers.backend import dr, mi
 from workers.elements import ElementSet
-from workers.lobes import LobeClass, context, diffuse_reflectance, has, specular_tint
+from workers.lobes import LobeClass, directional_lobes, has, specular_tint
 from workers.surfaces import SurfaceTable
 from workers.transport import CachedLobes, exitant_start, incident_radiance, lambertian_start
 
@@ -141,27 +141,11 @@ def bake_directional(
         direct += si.emitter(mi_scene).eval(si)
     else:
         whole = has(bits, LobeClass.WHOLE) if table.lobe_union & LobeClass.WHOLE else None
-        lobes = CachedLobes(*_split(table, si, bits), False, whole)
+        lobes = CachedLobes(*directional_lobes(si, bits, table.lobe_union), False, whole)
         direct, start = exitant_start(mi_scene, si, lobes, rng)
         tint = specular_tint(si.bsdf(), si, bits, table.lobe_union, everything)
     value = (direct + incident_radiance(mi_scene, start, rng, max_depth)) / tint
     return _block_mean(value, spp).reshape(len(batch.element), polar, azimuth, 3)
-
-
-def _split(
-    table: SurfaceTable, si: "mi.SurfaceInteraction3f", bits: "mi.UInt32"
-) -> "tuple[mi.BSDFContext, mi.Color3f]":
-    """Lobes left to the directional cache: those that are neither delta nor a maskable diffuse one.
-
-    A principled material ignores masks: its Lambertian part is taken away by value.
-    """
-    principled = has(bits, LobeClass.PRINCIPLED)
-    removed = mi.Color3f(0.0)
-    if table.lobe_union & LobeClass.PRINCIPLED:
-        removed = diffuse_reflectance(si.bsdf(), si, bits, LobeClass.PRINCIPLED, principled)
-    # Null: without it a `mask` material samples nothing but its hole; what hits the hole is dropped as delta.
-    mask = mi.BSDFFlags.Glossy | mi.BSDFFlags.DiffuseTransmission | mi.BSDFFlags.Null
-    return context(int(mask)), removed
 
 
 def direction_in_bin(

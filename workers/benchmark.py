@@ -5,6 +5,7 @@ Whatever is compared is timed interleaved in one run (`workers/timing.py`).
 
 import dataclasses
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from models.network import network_flops
 from storage.store import Store, UnitRef
 from workers.backend import dr, mi
 from workers.bake import LANES_PER_LAUNCH, load_caches
-from workers.bake_kernels import Batch, bake_diffuse, bake_directional
+from workers.bake_kernels import Batch
+from workers.bake_lobes import lobes_of
 from workers.camera import Camera
 from workers.denoise import QUALITIES, denoise
 from workers.element_stage import run_elements
@@ -203,9 +205,9 @@ def bake_throughput(run: RunState, repeats: int = 5, *, lanes_per_launch: int = 
         lanes_per_launch: paths of one launch, at most (a unit is never cut).
 
     Returns:
-        "max_depth", "repeats", "paths" of one launch by method ("diffuse", "directional", `PATH_TRACER`; a
-        lobe that the scene lacks is left out), "paths_per_s" by method, and "ratios" of each lobe to the path
-        tracer.
+        "max_depth", "repeats", "paths" of one launch by method (the cache sets by name, such as "diffuse" and
+        "directional-32x8", and `PATH_TRACER`; a lobe that the scene lacks is left out), "paths_per_s" by method,
+        and "ratios" of each set to the path tracer.
     """
     methods, paths = _bake_methods(run, run_elements(run), lanes_per_launch)
     camera = run.scene.camera.resized(run.settings.width, run.settings.height)
@@ -224,23 +226,13 @@ def _bake_methods(
     run: RunState, elements: ElementSet, lanes_per_launch: int
 ) -> tuple[dict[str, Callable[[int], object]], dict[str, int]]:
     """The bake's kernels on a launch each, and the paths of those launches."""
-    cache, mi_scene, table, depth = run.settings.cache, run.scene.mi_scene, run.table, run.scene.max_depth
-    grid, exitant = (cache.azimuth, cache.polar), cache.lobes == "exitant"
-    diffuse_spp, directional_spp = (-(-spp // cache.passes) for spp in (cache.diffuse_spp, cache.directional_spp))
     methods: dict[str, Callable[[int], object]] = {}
     paths: dict[str, int] = {}
-    if not exitant and elements.num_elements:
-        every = np.arange(elements.num_elements)
-        diffuse = spread_batch(every, cache.elements_per_unit, diffuse_spp, lanes_per_launch)
-        paths["diffuse"] = len(diffuse.element) * diffuse_spp
-        methods["diffuse"] = lambda index: bake_diffuse(mi_scene, table, elements, diffuse, diffuse_spp, index, depth)
-    if len(elements.glossy):
-        lanes = cache.azimuth * cache.polar * directional_spp
-        directional = spread_batch(elements.glossy, cache.elements_per_unit, lanes, lanes_per_launch)
-        paths["directional"] = len(directional.element) * lanes
-        methods["directional"] = lambda index: bake_directional(
-            mi_scene, table, elements, directional, grid, directional_spp, index, depth, exitant
-        )
+    for lobe in lobes_of(run, elements):
+        per_unit, lanes = run.settings.cache.elements_per_unit, lobe.lanes_per_element
+        batch = spread_batch(lobe.owners, per_unit, lanes, lanes_per_launch)
+        paths[lobe.name] = len(batch.element) * lanes
+        methods[lobe.name] = partial(lobe.kernel, batch)
     return methods, paths
 
 

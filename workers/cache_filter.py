@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from workers.elements import ElementSet
 
 # Part of the keys of what is made from filtered caches; raise it whenever the filter's result changes.
-FILTER_VERSION = 3
+FILTER_VERSION = 4
 NUM_NEIGHBOURS = 24
 PASSES = 2
 NORMAL_POWER = 16
@@ -22,6 +22,7 @@ SIGMA_SPACINGS_DIRECTIONAL = 1.0
 # Differences below this share of the values are no edge, whatever the measured variance says.
 FLOOR_SHARE = 1e-6
 TINY = np.finfo(np.float64).tiny
+FLOATS_AT_ONCE = 1 << 22  # of temporaries
 # A neighbour further than this many median spacings is no neighbour.
 MAX_SPACINGS = 3.0
 
@@ -64,26 +65,57 @@ def _filter_once(
     return np.einsum("nk,nkc->nc", total, values[index]), np.sum(total**2 * variance[index], axis=1)
 
 
-def filter_directional(elements: ElementSet, values: np.ndarray) -> np.ndarray:
-    """Denoised directional lobe: place and normal alone; float32 [g, polar, azimuth, 3], as given."""
+def filter_directional(elements: ElementSet, values: np.ndarray, slots: np.ndarray | None = None) -> np.ndarray:
+    """Denoised directional lobe: place and normal alone.
+
+    Args:
+        elements: where the values sit.
+        values: grids of one size, float32 [n, polar, azimuth, 3].
+        slots: place of each row in `ElementSet.glossy`, int64 [n]; None for all of them.
+
+    Returns:
+        float32 [n, polar, azimuth, 3]. Only rows given average each other, but they are neighbours by the spacing of
+        all glossy elements: one of few among other grids is left alone.
+    """
     if len(values) == 0:
         return values
-    index, weight = _neighbours(elements, elements.glossy, SIGMA_SPACINGS_DIRECTIONAL)
+    members = elements.glossy if slots is None else elements.glossy[slots]
+    spacing = None if slots is None else _spacing(elements, elements.glossy)[slots]
+    index, weight = _neighbours(elements, members, SIGMA_SPACINGS_DIRECTIONAL, spacing)
     weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
-    result = np.zeros_like(values)
-    for k in range(index.shape[1]):
-        result += values[index[:, k]] * weight[:, k, None, None, None]
+    result = np.empty_like(values)
+    rows_at_once = max(1, FLOATS_AT_ONCE // max(values[0].size, 1))
+    for first in range(0, len(values), rows_at_once):
+        chosen = slice(first, first + rows_at_once)
+        total = np.zeros_like(values[chosen])
+        for k in range(index.shape[1]):
+            total += values[index[chosen, k]] * weight[chosen, k, None, None, None]
+        result[chosen] = total
     return result
 
 
-def _neighbours(elements: ElementSet, members: np.ndarray, sigma_spacings: float) -> tuple[np.ndarray, np.ndarray]:
+def _spacing(elements: ElementSet, members: np.ndarray) -> np.ndarray:
+    """Median distance of each member to its nearest ones, float64 [n]."""
+    position = elements.position[members].astype(np.float64)
+    distance, _ = cKDTree(position).query(position, k=min(5, len(members)), workers=2)
+    return _median_distance(distance.reshape(len(members), -1))
+
+
+def _median_distance(distance: np.ndarray) -> np.ndarray:
+    """From the distances of the nearest members (itself first), [n, k]."""
+    return np.maximum(np.median(distance[:, 1:5], axis=1) if distance.shape[1] > 4 else distance[:, -1], 1e-30)
+
+
+def _neighbours(
+    elements: ElementSet, members: np.ndarray, sigma_spacings: float, spacing: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Nearest members of each member (itself first) and their weights; int64, float64 [n, k]."""
     position, normal = elements.position[members].astype(np.float64), elements.normal[members].astype(np.float64)
     shape, side = elements.shape[members], elements.side[members]
     k = min(NUM_NEIGHBOURS, len(members))
     distance, index = cKDTree(position).query(position, k=k, workers=2)
     distance, index = distance.reshape(len(members), k), index.reshape(len(members), k)
-    spacing = np.maximum(np.median(distance[:, 1:5], axis=1) if k > 4 else distance[:, -1], 1e-30)
+    spacing = _median_distance(distance) if spacing is None else spacing
     weight = np.exp(-0.5 * (distance / (sigma_spacings * spacing[:, None])) ** 2)
     weight *= np.maximum(np.einsum("nkc,nc->nk", normal[index], normal), 0.0) ** NORMAL_POWER
     weight *= (shape[index] == shape[:, None]) & (side[index] == side[:, None])

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from workers.backend import dr
+from workers.direction_grids import measure_spread
 from workers.lattice import (
     PatchTable,
     build_patch_table,
@@ -30,7 +31,7 @@ from workers.visibility import Hits
 NOT_BAKED = np.uint32(1 << 31)  # flag on a slot: answered by its nearest baked neighbour
 NO_SLOT = np.uint32(0xFFFFFFFF)
 # Part of the keys of what is made from element sets; raise it whenever the same settings give other elements.
-ELEMENTS_VERSION = 2
+ELEMENTS_VERSION = 3
 INSET = 0.15  # of the spacing
 MERGE_VOXEL = 0.45  # of the spacing
 SPACING_STEPS = 10
@@ -53,6 +54,8 @@ class ElementSet:
         normal: unit shading normal towards `side`, float32 [n, 3].
         footprint: pixel edge at the element in scene units, float32 [n] (inf where never seen).
         glossy: indices (into the above) of the elements with a directional lobe, int64 [g].
+        spread: angular width of that lobe in radians, float32 [g] (`workers/direction_grids.py`; infinite where
+            nothing is measured: all of the exitant radiance).
         diffuse_slot, glossy_slot: uint32 [2 * num_points], by lattice point * 2 + side; a slot into all
             elements or into `glossy`, `NOT_BAKED` set where it stands in for a neighbour (for any element
             where the material lacks the lobe), `NO_SLOT` where the lobe does not occur in the scene.
@@ -67,6 +70,7 @@ class ElementSet:
     position: np.ndarray
     normal: np.ndarray
     glossy: np.ndarray
+    spread: np.ndarray
     diffuse_slot: np.ndarray
     glossy_slot: np.ndarray
     spacing_px: float
@@ -289,6 +293,7 @@ def _assemble(
         uv = _inset(table, lattice, points, chosen)
         place = (points.shape[chosen], points.prim_local[chosen], uv, points.side[chosen])
         position, normal, _ = surface_frame(table, *place)
+    lobe_at = (points.shape[chosen][glossy], points.prim_local[chosen][glossy], uv[glossy], normal[glossy])
     return ElementSet(
         patches=lattice.patches,
         shape=points.shape[chosen],
@@ -298,6 +303,7 @@ def _assemble(
         position=position,
         normal=normal,
         glossy=glossy,
+        spread=np.full(len(glossy), np.inf, np.float32) if exitant else measure_spread(table, *lobe_at),
         diffuse_slot=slots.fill(
             np.where(diffuse_shape[points.shape[chosen]], np.arange(len(chosen)), -1), diffuse_shape
         ),

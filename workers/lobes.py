@@ -148,6 +148,24 @@ def specular_tint(
     return tint
 
 
+def directional_lobes(
+    si: "mi.SurfaceInteraction3f", bits: "mi.UInt32", union: LobeClass
+) -> "tuple[mi.BSDFContext, mi.Color3f]":
+    """Lobes left to the directional cache: those that are neither delta nor a maskable diffuse one.
+
+    Returns:
+        (context, reflectance of a Lambertian lobe to take away by value: a principled material ignores masks).
+        Lanes of class `WHOLE` keep every non-delta lobe instead.
+    """
+    principled = has(bits, LobeClass.PRINCIPLED)
+    removed = mi.Color3f(0.0)
+    if union & LobeClass.PRINCIPLED:
+        removed = diffuse_reflectance(si.bsdf(), si, bits, LobeClass.PRINCIPLED, principled)
+    # Null: without it a `mask` material samples nothing but its hole; what hits the hole is dropped as delta.
+    mask = mi.BSDFFlags.Glossy | mi.BSDFFlags.DiffuseTransmission | mi.BSDFFlags.Null
+    return context(int(mask)), removed
+
+
 def reflectance_at(table, elements) -> np.ndarray:
     """rho_d at cache elements seen along their normal, float32 [n, 3] (to undo demodulation)."""
     si = table.interaction(elements.shape, elements.prim_local, elements.uv)

@@ -18,6 +18,7 @@ from models.transfer import Transfer
 from storage.perceptual_weights import find_stlpips
 from workers.bake_kernels import bake_diffuse, bake_directional
 from workers.benchmark import spread_batch
+from workers.direction_grids import grid_shares
 from workers.elements import ElementSet
 from workers.pathtrace import flush, trace
 from workers.pilot import Pilot
@@ -26,13 +27,14 @@ from workers.query import CHANNELS
 from workers.reconstruct import channels_last
 from workers.run_state import RunState
 from workers.settings import Settings
+from workers.texels import pack_rows
 
 CALIBRATION_PATHS = 1 << 19
 CALIBRATION_EDGE_PX = 256
 # Records beside the values: JSON of each bake unit and of the set, a part of it for every array.
 UNIT_NBYTES, UNIT_ARRAY_NBYTES = 582, 210
 SET_NBYTES, SET_ARRAY_NBYTES = 1015, 915
-VALUE_NBYTES = 4
+VALUE_NBYTES, TEXEL_NBYTES, TOP_NBYTES = 4, 4, 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,17 +102,12 @@ def stage_costs(settings: Settings, elements: ElementSet, rates: Rates, pilot: P
     cache, frames = settings.cache, settings.frames
     pixels = settings.width * settings.height
     costs = [StageCost(stage="elements", paths=0, seconds=rates.elements_s, note="as in this plan")]
-    lobes = (
-        ("diffuse", elements.num_elements if cache.lobes == "split" else 0, 1, cache.diffuse_spp, 2, rates.diffuse),
-        ("directional", len(elements.glossy), cache.azimuth * cache.polar, cache.directional_spp, 1, rates.directional),
-    )
-    for lobe, rows, directions, spp, arrays, rate in lobes:
-        if rows:
-            per_pass = -(-spp // cache.passes)
-            paths = rows * directions * per_pass * cache.passes
-            nbytes = cache_nbytes(rows, directions * 3, arrays, cache.elements_per_unit, pilot.samples.get(lobe, []))
-            costs.append(StageCost(stage=f"bake {lobe}", paths=paths, seconds=paths / rate, nbytes=nbytes,
-                                   note=_rate_note(paths, rate)))  # fmt: skip
+    for one in _sets(settings, elements, pilot):
+        per_pass = -(-one.spp // cache.passes)
+        paths = one.rows * one.directions * per_pass * cache.passes
+        rate = rates.diffuse if one.name == "diffuse" else rates.directional
+        costs.append(StageCost(stage=f"bake {one.name}", paths=paths, seconds=paths / rate,
+                               nbytes=cache_nbytes(one, cache.elements_per_unit), note=_rate_note(paths, rate)))  # fmt: skip
     for name, count, spp in (("training frames", frames.num_train, frames.train_spp),
                              ("validation frames", frames.num_validation, frames.train_spp),
                              ("test references", frames.num_test, frames.test_spp)):  # fmt: skip
@@ -125,14 +122,40 @@ def _rate_note(paths: int, rate: float) -> str:
     return f"{paths / 1e6:.3g} M paths at {rate / 1e6:.2f} M/s"
 
 
-def cache_nbytes(
-    rows: int, values_per_row: int, arrays: int, rows_per_unit: int, samples: list[np.ndarray]
-) -> int:  # fmt: skip
+@dataclass(frozen=True)
+class _Set:
+    """One cache set: its shape, and a sample of its arrays as they lie in the store."""
+
+    name: str
+    rows: int
+    directions: int
+    spp: int
+    row_nbytes: int
+    arrays: int
+    samples: list[np.ndarray]
+
+
+def _sets(settings: Settings, elements: ElementSet, pilot: Pilot) -> list[_Set]:
+    cache, sets = settings.cache, list[_Set]()
+    if cache.lobes == "split" and elements.num_elements:
+        plain = pilot.samples.get("diffuse", [])
+        sets.append(_Set("diffuse", elements.num_elements, 1, cache.diffuse_spp, 2 * 3 * VALUE_NBYTES, 2, plain))
+    packs = cache.texels == "rgb9e5" and cache.lobes == "split"
+    floats = pilot.samples.get("directional", [])
+    # Signed or not makes no difference to the size.
+    samples = [array for rows in floats for array in pack_rows(rows, signed=False).values()] if packs else floats
+    for share in grid_shares(elements, cache):
+        directions = share.grid[0] * share.grid[1]
+        row_nbytes = directions * TEXEL_NBYTES + TOP_NBYTES if packs else directions * 3 * VALUE_NBYTES
+        sets.append(_Set(share.name, share.rows, directions, share.spp, row_nbytes, 2 if packs else 1, samples))
+    return sets
+
+
+def cache_nbytes(one: _Set, rows_per_unit: int) -> int:
     """Bytes of a cache set at rest: its values, compressed as well as the pilot's, and its records."""
-    raw = rows * values_per_row * arrays * VALUE_NBYTES
-    units = -(-rows // rows_per_unit)
-    records = units * (UNIT_NBYTES + UNIT_ARRAY_NBYTES * arrays) + SET_NBYTES + SET_ARRAY_NBYTES * arrays
-    return int(raw * compressed_share(samples)) + records
+    units = -(-one.rows // rows_per_unit)
+    records = units * (UNIT_NBYTES + UNIT_ARRAY_NBYTES * one.arrays) + SET_NBYTES + SET_ARRAY_NBYTES * one.arrays
+    return int(one.rows * one.row_nbytes * compressed_share(one.samples)) + records
 
 
 def compressed_share(samples: list[np.ndarray]) -> float:

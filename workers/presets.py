@@ -22,7 +22,7 @@ PRESET_OVERRIDES: dict[str, dict[str, Any]] = {
     },
     "tiny": {
         "width": 64, "height": 64, "cache.max_elements": 1500, "cache.domain_poses": 4, "cache.diffuse_spp": 64,
-        "cache.azimuth": 8, "cache.polar": 4, "cache.directional_spp": 4, "frames.num_train": 4,
+        "cache.azimuth": 16, "cache.polar": 4, "cache.directional_spp": 4, "frames.num_train": 4,
         "frames.num_validation": 1, "frames.num_test": 2, "frames.train_spp": 32, "frames.test_spp": 64,
         "frames.passes": 2, "train.epochs": 3, "train.seconds": 20.0, "train.batch": 2, "train.crop": 32,
         "train.widths": (16, 16, 16), "evaluation.spp": (1,), "evaluation.timing_repeats": 2,

@@ -169,7 +169,12 @@ class _Query:
         seen = hits.view if self.caches.exitant else _mirror(_mirror(hits.view, hits.normal), normal)
         frame = mi.Frame3f(mi.Vector3f(np.ascontiguousarray(normal.T)))
         x, y, z = ((_rows(axis) * seen).sum(1) for axis in (frame.s, frame.t, frame.n))
-        return bilinear(self.caches.directional.astype(np.float64), slot, x, y, z)
+        result = np.empty((len(slot), 3))
+        for members, grids in self.caches.texels.grids():  # those of one size at a time
+            row = np.searchsorted(members, slot).clip(max=len(members) - 1)
+            here = members[row] == slot
+            result[here] = bilinear(grids.astype(np.float64), row[here], x[here], y[here], z[here])
+        return result
 
     # ------------------------------------------- shading -------------------------------------------
 

@@ -11,9 +11,10 @@ import numpy as np
 from workers.backend import dr, mi
 from workers.elements import NO_SLOT, NOT_BAKED, ElementSet
 from workers.lobes import LobeClass, diffuse_reflectance, has, specular_tint
+from workers.query_directional import DirectionalLookup, four_channels, with_locators, xyz
 from workers.surfaces import SurfaceTable
+from workers.texels import DirectionalTexels
 
-GRAZING_COSINE = 0.02
 STAND_IN_WEIGHT = 1e-4  # a stand-in counts only where no baked point does
 
 
@@ -23,15 +24,22 @@ class CacheArrays:
 
     Attributes:
         diffuse: D (or the diffuse lobe itself, not demodulated) of every element, float32 [n, 3].
-        directional: S of the elements in `ElementSet.glossy`, float32 [g, polar, azimuth, 3].
+        directional: S of the elements in `ElementSet.glossy`; float32 [g, polar, azimuth, 3] is one grid for all.
         demodulated: whether `diffuse` is to be multiplied by the pixel's reflectance.
         exitant: whether `directional` holds all of the exitant radiance (paper-exact).
     """
 
     diffuse: np.ndarray
-    directional: np.ndarray
+    directional: DirectionalTexels | np.ndarray
     demodulated: bool = True
     exitant: bool = False
+
+    @property
+    def texels(self) -> DirectionalTexels:
+        """The directional cache as the query reads it."""
+        if isinstance(self.directional, DirectionalTexels):
+            return self.directional
+        return DirectionalTexels.uniform(self.directional)
 
 
 @dataclass
@@ -61,11 +69,11 @@ class CacheShading:
             mi.UInt32(elements.diffuse_slot),
             mi.UInt32(elements.glossy_slot),
         )
-        self.diffuse = mi.Float(_four_channels(caches.diffuse))
-        self.polar, self.azimuth = caches.directional.shape[1:3] if caches.directional.ndim == 4 else (1, 1)
-        self.directional = mi.Float(_four_channels(caches.directional))
-        self.glossy_normal = mi.Float(_four_channels(elements.normal[elements.glossy]))
-        self.glossy_position = mi.Float(_four_channels(elements.position[elements.glossy]))
+        self.diffuse = mi.Float(four_channels(caches.diffuse))
+        self.directional = DirectionalLookup(caches.texels)
+        normals = four_channels(elements.normal[elements.glossy])
+        self.glossy_normal = mi.Float(with_locators(normals, caches.texels))
+        self.glossy_position = mi.Float(four_channels(elements.position[elements.glossy]))
         self.is_parametric = mi.UInt32(table.is_parametric.astype(np.uint32))
         self.has_diffuse = bool(np.any(elements.diffuse_slot != NO_SLOT))
         self.has_glossy = bool(np.any(elements.glossy_slot != NO_SLOT))
@@ -74,6 +82,7 @@ class CacheShading:
         """All device memory that a frozen program reads."""
         table = self.table
         arrays = tuple(value for value in vars(self).values() if dr.is_array_v(value))
+        arrays += (self.directional.texels,)
         return arrays, self.scene, table.index_of_registry, table.prim_offset_dr, table.lobe_bits_dr
 
     def shade(self, pi, si, active) -> Shaded:
@@ -182,9 +191,11 @@ class CacheShading:
             for point, weight in zip(points, weights, strict=True):
                 slot, baked = self.slot(self.glossy_slot, point, active)
                 weight = dr.select(baked, weight, weight * STAND_IN_WEIGHT)
-                n = xyz(dr.gather(mi.Vector4f, self.glossy_normal, slot, active))
+                packet = dr.gather(mi.Vector4f, self.glossy_normal, slot, active)
+                n = xyz(packet)
                 direction = 2 * dr.dot(mirrored, n) * n - mirrored if reflect else view
-                value += self._bilinear(slot, mi.Frame3f(n).to_local(direction), active) * weight
+                local = mi.Frame3f(n).to_local(direction)
+                value += self.directional.bilinear(slot, packet.w, local, active) * weight
                 covered += dr.select(baked, weight, 0.0)
                 total += weight
             scale = dr.select(active, dr.rcp(dr.maximum(total, 1e-20)), 0.0)
@@ -198,26 +209,6 @@ class CacheShading:
         """(slot of a lattice point, whether it was baked there)."""
         raw = dr.gather(mi.UInt32, table, point, active)
         return raw & mi.UInt32(int(NOT_BAKED) - 1), (raw & mi.UInt32(int(NOT_BAKED))) == 0
-
-    def _bilinear(self, slot, local, active):
-        """Bilinear lookup by polar angle and azimuth of one element's grid."""
-        cos_theta = dr.maximum(local.z, GRAZING_COSINE)
-        theta = dr.safe_acos(cos_theta) * (2 / dr.pi) * self.polar - 0.5
-        phi = dr.atan2(local.y, local.x) * dr.inv_two_pi * self.azimuth - 0.5
-        phi = dr.select(phi < 0, phi + self.azimuth, phi)
-        row = dr.clip(dr.floor(theta), 0.0, max(self.polar - 2, 0))
-        column = dr.floor(phi)
-        ft, fp = dr.clip(theta - row, 0.0, 1.0), phi - column
-        r0 = mi.UInt32(row)
-        r1 = dr.minimum(r0 + 1, self.polar - 1)
-        c0 = mi.UInt32(column) % self.azimuth
-        c1 = (c0 + 1) % self.azimuth
-        result = mi.Color3f(0)
-        for r, c, w in ((r0, c0, (1 - ft) * (1 - fp)), (r0, c1, (1 - ft) * fp), (r1, c0, ft * (1 - fp)),
-                        (r1, c1, ft * fp)):  # fmt: skip
-            index = (slot * self.polar + r) * self.azimuth + c
-            result += mi.Color3f(xyz(dr.gather(mi.Vector4f, self.directional, index, active))) * w
-        return result
 
 
 class _AskedOnce:
@@ -248,18 +239,6 @@ class _AskedOnce:
 
 def _interleaved(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.stack([first, second], 1).astype(np.uint32).reshape(-1)
-
-
-def _four_channels(values: np.ndarray) -> np.ndarray:
-    """[..., 3] as a flat array with four floats a row: one packet gather instead of three."""
-    rows = values.reshape(-1, 3)
-    padded = np.zeros((max(len(rows), 1), 4), np.float32)
-    padded[: len(rows), :3] = rows
-    return padded.reshape(-1)
-
-
-def xyz(value: "mi.Vector4f") -> "mi.Vector3f":
-    return mi.Vector3f(value.x, value.y, value.z)
 
 
 def _patch_cell(uv, m, square):

@@ -30,8 +30,15 @@ class CacheSettings:
         min_spacing_px: no finer than this many pixels of the domain's cameras.
         domain_poses: poses of the camera domain that decide what is seen.
         diffuse_spp: paths per element for the diffuse lobe.
-        azimuth, polar: directions per element of the directional lobe.
-        directional_spp: paths per direction.
+        grids: "adaptive" (each element gets the coarsest grid of 8x2, 16x4, 32x8, 64x16 and 128x32 that its
+            lobe's width asks for) or "uniform" (azimuth x polar everywhere; always so where lobes is "exitant").
+        azimuth, polar: directions per element of the directional lobe; with adaptive grids the finest one that
+            is allowed (below 8x2 they are used as they are).
+        directional_spp: paths per direction of the finest grid allowed; each coarser one doubles them, which
+            halves the paths of an element.
+        texels: the directional lobe at rest and in the query: "rgb9e5" (shared exponent, 4 bytes a texel, error at
+            most 1/512 of its largest channel, 1/256 for principled materials) or "float32" (12 bytes at rest,
+            16 in the query; always so where lobes is "exitant").
         passes: equal slices of a unit's samples; between them a bake reports and can be cancelled.
         elements_per_unit: cache elements in one unit of work (one chunk at rest).
         max_edge_fraction: paper tessellation, longest edge allowed as a share of the scene's diagonal ("triangle",
@@ -46,9 +53,11 @@ class CacheSettings:
     min_spacing_px: float = 1.5
     domain_poses: int = 40
     diffuse_spp: int = 2048
+    grids: Literal["uniform", "adaptive"] = "adaptive"
     azimuth: int = 32
     polar: int = 8
     directional_spp: int = 8
+    texels: Literal["float32", "rgb9e5"] = "rgb9e5"
     passes: int = 1
     elements_per_unit: int = 256
     max_edge_fraction: float = 0.05

@@ -128,8 +128,8 @@ def plane() -> ElementSet:
         patches=patches, shape=np.zeros(count, np.int64), prim_local=np.zeros(count, np.int64),
         uv=np.zeros((count, 2), np.float32), side=np.zeros(count, np.uint8),
         position=np.stack([x, y, 0 * x], -1).astype(np.float32),
-        normal=np.tile(np.float32([0, 0, 1]), (count, 1)), glossy=np.arange(0), diffuse_slot=np.zeros(2, np.uint32),
-        glossy_slot=np.zeros(2, np.uint32), spacing_px=1.0,
+        normal=np.tile(np.float32([0, 0, 1]), (count, 1)), glossy=np.arange(0), spread=np.zeros(0, np.float32),
+        diffuse_slot=np.zeros(2, np.uint32), glossy_slot=np.zeros(2, np.uint32), spacing_px=1.0,
     )  # fmt: skip
 
 

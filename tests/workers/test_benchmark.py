@@ -17,6 +17,7 @@ from models.transfer import Transfer
 from storage.store import Store
 from workers import benchmark, timing
 from workers.bake import run_bake
+from workers.direction_grids import directional_cost
 from workers.element_stage import run_elements
 from workers.errors import WorkerError
 from workers.progress import Progress
@@ -206,13 +207,13 @@ def test_spread_batch_holds_a_unit_even_where_it_exceeds_a_launch() -> None:
 def test_bake_throughput_counts_the_paths_of_both_lobes_and_of_mitsuba(run: RunState) -> None:
     result = benchmark.bake_throughput(run, 1)
     elements, cache = run_elements(run), run.settings.cache
-    directional = len(elements.glossy) * cache.azimuth * cache.polar * cache.directional_spp
-    paths = result["paths"]
-    assert paths["diffuse"] == elements.num_elements * cache.diffuse_spp
-    assert paths["directional"] == directional > 0
-    assert paths[benchmark.PATH_TRACER] == pytest.approx(directional, abs=32 * 32 / 2)
+    paths = dict(result["paths"])
+    traced = paths.pop(benchmark.PATH_TRACER)
+    assert paths.pop("diffuse") == elements.num_elements * cache.diffuse_spp
+    assert sum(paths.values()) == directional_cost(elements, cache)["paths"] > 0
+    assert traced == pytest.approx(max(result["paths"].values()), abs=32 * 32 / 2)
     rates = result["paths_per_s"]
-    assert result["ratios"] == {name: rates[name] / rates[benchmark.PATH_TRACER] for name in ("diffuse", "directional")}
+    assert result["ratios"] == {name: rates[name] / rates[benchmark.PATH_TRACER] for name in ("diffuse", *paths)}
     assert json.loads(json.dumps(result)) == result
 
 

@@ -28,6 +28,7 @@ def plane() -> ElementSet:
         position=position,
         normal=np.tile(np.float32([0, 0, 1]), (n, 1)),
         glossy=np.arange(n),
+        spread=np.full(n, np.inf, np.float32),
         diffuse_slot=np.zeros(2, np.uint32),
         glossy_slot=np.zeros(2, np.uint32),
         spacing_px=1.0,

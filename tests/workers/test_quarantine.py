@@ -10,7 +10,8 @@ import pytest
 from storage.caches import ArraySpec, CacheSet
 from storage.store import Store, UnitRef
 from workers import bake, render
-from workers.bake import _bake_units, _Lobe
+from workers.bake import _bake_units
+from workers.bake_lobes import Lobe
 from workers.camera import Camera
 from workers.errors import QuarantinedError
 from workers.pathtrace import trace
@@ -37,7 +38,7 @@ def test_bake_unit_over_its_limit_is_set_aside_and_the_others_are_kept(store: St
     run: Any = types.SimpleNamespace(settings=Settings.preset_named("tiny"), store=store, progress=Progress())
     values = np.ones((PER_UNIT * NUM_UNITS, 3), np.float32)
     values[PER_UNIT] = np.nan  # in unit 1
-    lobe = _Lobe("diffuse", {}, {"mean": (3,)}, np.arange(len(values)), 1, lambda batch, index: {"mean": values})
+    lobe = Lobe("diffuse", {}, {"mean": (3,)}, np.arange(len(values)), 1, lambda batch, index: {"mean": values})
     with pytest.raises(QuarantinedError, match=r"bake unit 1 of the diffuse lobe must be finite, got 3 of 12 values"):
         _bake_units(run, lobe, caches, [0, 1, 2], PER_UNIT)
     assert caches.committed_units() == {0, 2}
@@ -53,8 +54,8 @@ def test_bake_unit_over_its_limit_is_set_aside_and_the_others_are_kept(store: St
     assert (caches.committed_units(), store.quarantined()) == ({0, 1, 2}, [])
 
 
-def one_unit(lobe: _Lobe, values: np.ndarray) -> _Lobe:
-    return _Lobe(lobe.name, {}, lobe.arrays, lobe.owners, 1, lambda batch, index: {"mean": values})
+def one_unit(lobe: Lobe, values: np.ndarray) -> Lobe:
+    return Lobe(lobe.name, {}, lobe.arrays, lobe.owners, 1, lambda batch, index: {"mean": values})
 
 
 def test_stray_values_are_zeroed_and_counted() -> None:

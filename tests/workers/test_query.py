@@ -10,6 +10,7 @@ import pytest
 from workers.backend import mi
 from workers.bake_kernels import Batch, bake_diffuse
 from workers.camera import Camera
+from workers.direction_grids import grid_of
 from workers.elements import NOT_BAKED, ElementSet, build_elements
 from workers.progress import Progress
 from workers.query import CHANNELS, CacheArrays, QueryProgram
@@ -17,6 +18,7 @@ from workers.query_reference import bilinear, camera_rays, query_reference
 from workers.scene import load_scene
 from workers.settings import CacheSettings, QuerySettings
 from workers.surfaces import SurfaceTable, build_surface_table
+from workers.texels import DirectionalTexels, Packing
 from workers.visibility import Hits, domain_hits
 
 TOLERANCE = 1e-4
@@ -86,6 +88,20 @@ def random_caches(elements: ElementSet, **kind: bool) -> CacheArrays:
     return CacheArrays(diffuse, directional, **kind)
 
 
+def mixed_caches(elements: ElementSet, packing: Packing | None) -> CacheArrays:
+    """As `random_caches`, on three grids at once: neighbours in the lattice lie on different ones."""
+    rng = np.random.default_rng(1)
+    rung = rng.integers(0, 3, len(elements.glossy)).astype(np.uint8)
+    low = -0.5 if packing is not None and packing.signed else 0.0
+
+    def load(one: int) -> np.ndarray:
+        azimuth, polar = grid_of(one)
+        return rng.uniform(low, 1.0, ((rung == one).sum(), polar, azimuth, 3)).astype(np.float32)
+
+    diffuse = rng.random((elements.num_elements, 3), dtype=np.float32)
+    return CacheArrays(diffuse, DirectionalTexels.ladder(rung, load, packing))
+
+
 def constant_caches(elements: ElementSet, diffuse: float, directional: float) -> CacheArrays:
     return CacheArrays(
         np.full((elements.num_elements, 3), diffuse, np.float32),
@@ -100,9 +116,15 @@ def layers(image: np.ndarray) -> dict[str, np.ndarray]:
 def check_against_reference(
     where: Seen, cache: CacheSettings, query: QuerySettings, budget_px: int = 0, **kind: bool
 ) -> dict[str, np.ndarray]:
-    """Compares every channel to 1e-4; at most `budget_px` pixels, at edges, may fall on another surface."""
     elements = build_elements(where.table, where.hits, cache)
     caches = random_caches(elements, exitant=cache.lobes == "exitant", **kind)
+    return compare_with_reference(where, elements, caches, query, budget_px)
+
+
+def compare_with_reference(
+    where: Seen, elements: ElementSet, caches: CacheArrays, query: QuerySettings, budget_px: int
+) -> dict[str, np.ndarray]:
+    """Compares every channel to 1e-4; at most `budget_px` pixels, at edges, may fall on another surface."""
     fast = layers(QueryProgram(where.scene, where.table, elements, caches, query).run(where.camera))
     slow = query_reference(where.scene, where.table, elements, caches, query, where.camera)
     assert fast.keys() == slow.keys()
@@ -146,6 +168,29 @@ def test_program_agrees_with_the_reference_without_demodulation(tiny: Seen) -> N
 def test_program_agrees_with_the_reference_behind_glass(vitrine: Seen, query: QuerySettings) -> None:
     slow = check_against_reference(vitrine, CacheSettings(max_elements=600), query, budget_px=3)
     assert 0.02 < np.isnan(slow["position"]).mean() < 0.9, "some rays meet the sky"
+
+
+@pytest.mark.parametrize(
+    "packing", [None, Packing(0, signed=False), Packing(0, signed=True)], ids=["float32", "rgb9e5", "signed"]
+)
+def test_program_agrees_with_the_reference_on_mixed_grids(vitrine: Seen, packing: Packing | None) -> None:
+    """The reference reads the texels as they are unpacked, so packing makes no difference between the two."""
+    elements = build_elements(vitrine.table, vitrine.hits, CacheSettings(max_elements=600))
+    caches = mixed_caches(elements, packing)
+    compare_with_reference(vitrine, elements, caches, QuerySettings(samples=1), budget_px=3)
+
+
+def test_packed_texels_of_one_grid_change_the_image_by_their_bound(tiny: Seen) -> None:
+    elements = build_elements(tiny.table, tiny.hits, LATTICE)
+    caches, query = random_caches(elements), QuerySettings(samples=1)
+    assert isinstance(caches.directional, np.ndarray)
+    packing = Packing(0, signed=False)
+    packed = dataclasses.replace(caches, directional=DirectionalTexels.uniform(caches.directional, packing))
+    exact, close = (
+        layers(QueryProgram(tiny.scene, tiny.table, elements, arrays, query).run(tiny.camera))["ir"]
+        for arrays in (caches, packed)
+    )
+    assert 0 < np.abs(close - exact).max() <= packing.error * 1.01
 
 
 def test_program_is_bit_identical_twice(tiny: Seen) -> None:
