@@ -108,11 +108,10 @@ def grid_shares(elements: "ElementSet", cache: CacheSettings) -> list[GridShare]
     if rungs is None:
         whole = GridShare("directional", len(elements.glossy), (cache.azimuth, cache.polar), cache.directional_spp)
         return [whole] if whole.rows else []
+    present, rows = np.unique(rungs, return_counts=True)
     return [
-        GridShare(
-            set_name(grid_of(rung)), int(np.sum(rungs == rung)), grid_of(rung), samples_per_direction(rung, cache)
-        )
-        for rung in np.unique(rungs).tolist()
+        GridShare(set_name(grid_of(rung)), count, grid_of(rung), samples_per_direction(rung, cache))
+        for rung, count in zip(present.tolist(), rows.tolist(), strict=True)
     ]
 
 

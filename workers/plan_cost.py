@@ -106,8 +106,9 @@ def stage_costs(settings: Settings, elements: ElementSet, rates: Rates, pilot: P
         per_pass = -(-one.spp // cache.passes)
         paths = one.rows * one.directions * per_pass * cache.passes
         rate = rates.diffuse if one.name == "diffuse" else rates.directional
-        costs.append(StageCost(stage=f"bake {one.name}", paths=paths, seconds=paths / rate,
-                               nbytes=cache_nbytes(one, cache.elements_per_unit), note=_rate_note(paths, rate)))  # fmt: skip
+        nbytes = cache_nbytes(one, cache.elements_per_unit)
+        costs.append(StageCost(stage=f"bake {one.name}", paths=paths, seconds=paths / rate, nbytes=nbytes,
+                               note=_rate_note(paths, rate)))  # fmt: skip
     for name, count, spp in (("training frames", frames.num_train, frames.train_spp),
                              ("validation frames", frames.num_validation, frames.train_spp),
                              ("test references", frames.num_test, frames.test_spp)):  # fmt: skip
