@@ -30,7 +30,7 @@ from workers.train import run_train
 PAPER: dict[str, Any] = {
     "cache.elements": "triangle", "cache.lobes": "exitant", "cache.azimuth": 64, "cache.polar": 16,
     "query.weights": "paper", "query.samples": 1, "train.transfer": "log1p", "train.residual": False,
-    "train.unshuffle": 1, "train.schedule": "paper",
+    "train.unshuffle": 1, "train.widths": (32, 48, 64), "train.schedule": "paper",
 }  # fmt: skip
 _PAPER_CACHE = {key: value for key, value in PAPER.items() if not key.startswith("train.")}
 
@@ -58,6 +58,7 @@ def variants(settings: Settings) -> list[Variant]:
                 "cache.directional_spp": half}, network=False),
         Variant("paper, our network", _PAPER_CACHE),
         Variant("ours, no demodulation", {"cache.demodulate": False}),
+        Variant("ours, blocks of 4x4 pixels", {"train.unshuffle": 4, "train.widths": (48, 64, 96)}),
         Variant("ours, concatenation", {"train.fusion": "concatenate"}),
         Variant("ours, L1 only", {"train.perceptual_weight": 0.0}),
         Variant("ours, perceptual only", {"train.l1_weight": 0.0, "train.perceptual_weight": 1.0}),
