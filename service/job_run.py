@@ -36,7 +36,7 @@ POLL_SECONDS = 0.2
 SECONDS_BETWEEN_PROGRESS = 0.5
 SECONDS_BETWEEN_PREVIEWS = 3.0
 AHEAD = 2  # units asked for, by slot
-EVALUATION_STAGE, RESULT_FILE = "evaluation", "evaluation.json"
+EVALUATION_STAGE, RESULT_FILE, REPORT_FILE = "evaluation", "evaluation.json", "report.html"
 STORE_STAGES = {"seal": "bake"}  # where a stage's units lie, if not under its own name
 
 
@@ -232,6 +232,8 @@ class JobRun:
         if evaluation_key is not None:
             ref = UnitRef(self._census.digest, EVALUATION_STAGE, evaluation_key)
             evaluation = json_values(json.loads(self._store.read(ref, RESULT_FILE)))
+            if REPORT_FILE in (self._store.committed(ref) or {}).get("files", {}):
+                self._on_event({"kind": "report", "html": self._store.read(ref, REPORT_FILE).decode()})
         return {
             "evaluation": evaluation, "units": sum(run.block.total for run in self._runs.values()),
             "computed": sum(run.computed for run in self._runs.values()), "set_aside": self._set_aside,

@@ -128,7 +128,8 @@ class FakeStages:
     def _evaluate(self, unit: Unit, store: Store) -> str:
         scores = {"rows": [{"name": "ours", "psnr": float("inf")}], "without": list(unit.without)}
         key = self.key("evaluation", *unit.without, self.variant)
-        return self._commit(store, "evaluation", key, {"evaluation.json": json.dumps(scores).encode()})
+        files = {"evaluation.json": json.dumps(scores).encode(), "report.html": b"<html>pictures</html>"}
+        return self._commit(store, "evaluation", key, files)
 
     def _commit(self, store: Store, stage: str, key: str, files: dict[str, bytes] | None = None) -> str:
         store.commit(UnitRef(self.digest, stage, key), files or {"data": stage.encode()}, {})

@@ -53,6 +53,7 @@ def test_job_runs_every_unit_once_and_tells_its_progress(runner: DaskRunner, tmp
     watch = Watch()
     result = watch.run(runner, fake_spec(tmp_path, digest="once"))
     assert result["evaluation"]["rows"] == [{"name": "ours", "psnr": None}]
+    assert watch.of("report") == [{"kind": "report", "html": "<html>pictures</html>"}]
     assert result["set_aside"] == []
     assert result["units"] == result["computed"] == 1 + 1 + 1 + 6 + 20 + 1 + 4 + 1 + 1
     assert max(Counter(name for name, _, _ in started(tmp_path)).values()) == 1
