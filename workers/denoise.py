@@ -3,7 +3,6 @@
 import mitsuba_oidn
 import numpy as np
 
-from workers.backend import pool_at_rest
 from workers.errors import WorkerError
 
 QUALITIES = ("fast", "balanced", "high")
@@ -44,8 +43,8 @@ def denoise(
     scaled = radiance if unit == 1.0 else radiance / unit
     images = [None if x is None else np.ascontiguousarray(x, np.float32) for x in (scaled, albedo, normal)]
     strength = getattr(mitsuba_oidn.Quality, quality.capitalize())
-    with pool_at_rest():
-        result = mitsuba_oidn.denoise(*images, hdr=True, clean_aux=clean_features, quality=strength)
+    # Not with Dr.Jit's pool at rest: this denoiser computes on that pool, and would take twice as long.
+    result = mitsuba_oidn.denoise(*images, hdr=True, clean_aux=clean_features, quality=strength)
     return np.asarray(result) if unit == 1.0 else np.asarray(result) * np.float32(unit)
 
 
