@@ -2,7 +2,7 @@
 
 One sample is exact where a pixel and its neighbours see one smooth surface. The others (silhouettes, texture edges,
 edges of shadows and reflections) get further samples, compacted into packets of their own. Measured against 4x4
-samples everywhere (256x256 to 1920x1080, three scenes), the radiance is between 1.0 dB worse (`tabletop` at 640x360) and
+samples everywhere (256x256 to 1920x1080, three scenes), the radiance is between 1.0 dB worse (`tabletop`, 640x360) and
 1.4 dB better than with 2x2 everywhere, for 11 to 22 % of the pixels at 256x256 and 2 to 7 % at 1920x1080, where the
 query takes half the time; at 256x256 it takes 0.8 to 1.1 of it.
 """
