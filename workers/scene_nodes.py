@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from workers.backend import VARIANT, mi
 from workers.errors import SceneError
+from workers.scene_instances import expand_instances
 
 PINHOLE_SENSORS = ("perspective", "thinlens")
-_INSTANCES = ("instance", "shapegroup")
 _PATH_INTEGRATORS = ("path", "volpath", "volpathmis", "prb", "prb_basic", "prbvolpath", "ptracer")
 DEFAULT_MAX_DEPTH = 12
 _CPP_PLACE = re.compile(r"\[[\w./-]+\.(?:cpp|h):\d+\]\s*")
@@ -104,18 +104,12 @@ def name_shapes(state: Any) -> None:
 
 
 def audit_nodes(state: Any, what: str) -> list[str]:
-    """Refuse what caches cannot hold; returns notes about what is ignored.
+    """Write instances out; returns notes about that and about what is ignored.
 
     Raises:
-        SceneError: instanced shapes.
+        SceneError: instances that cannot be written out.
     """
-    notes = []
-    for node in nodes_of(state, mi.ObjectType.Shape):
-        if node.props.plugin_name() in _INSTANCES:
-            raise SceneError(
-                f"{what}: shapes must not be instances (they share one mesh, caches belong to one "
-                f"place), got a {node.props.plugin_name()}; write the instances out as separate meshes"
-            )
+    notes = expand_instances(state, what)
     if any(True for _ in nodes_of(state, mi.ObjectType.Medium)):
         notes.append("participating media are ignored: light crosses them as if they were empty")
     for node in nodes_of(state, mi.ObjectType.Integrator):

@@ -2,7 +2,8 @@
 
 Mitsuba turns a plugin's name into the path of a shared library, so a name that nobody has looked at is code
 that nobody has looked at. `tests/workers/test_scene_plugins.py` builds everything in `PLUGINS` through `load_scene`.
-What is left out is in `REFUSED_PLUGINS` with its reason; the same test holds that the two together are all that the
+What is left out is in `REFUSED_PLUGINS` with its reason (instances of a file that its owner names are
+written out, `workers/scene_instances.py`); the same test holds that the two together are all that the
 installed Mitsuba has.
 """
 
@@ -37,14 +38,15 @@ PLUGINS: dict[str, frozenset[str]] = {
 """By the XML tag that they are usually written with."""
 
 _NOT_A_SURFACE = "caches sit on meshes, disks, spheres and cylinders; convert it to a mesh"
+_MULTIPLIES = "a few bytes would stand for any number of meshes; write them out as separate meshes"
 REFUSED_PLUGINS: dict[str, str] = {
     "blender": "it reads the memory addresses that the scene gives it",
     "bsplinecurve": _NOT_A_SURFACE,
     "ellipsoids": _NOT_A_SURFACE,
     "linearcurve": _NOT_A_SURFACE,
     "sdfgrid": _NOT_A_SURFACE,
-    "instance": "caches belong to one place, instances share a mesh; write them out as separate meshes",
-    "shapegroup": "caches belong to one place, instances share a mesh; write them out as separate meshes",
+    "instance": _MULTIPLIES,
+    "shapegroup": _MULTIPLIES,
     "measured_polarized": "it needs a polarized or monochrome render, scenes here have three linear channels",
     "specfilm": "it needs a spectral render, scenes here have three linear channels; use hdrfilm",
     "stokes": "it needs a polarized render, scenes here have three linear channels; use path",

@@ -39,7 +39,7 @@ def test_the_loader_builds_every_allowed_plugin(tmp_path: Path, tag: str, name: 
     load_scene(path, width=edge_px, height=edge_px)
 
 
-@pytest.mark.parametrize("name", ["instance", "shapegroup", "specfilm", "stokes"])
+@pytest.mark.parametrize("name", ["instance", "specfilm", "stokes"])
 def test_the_loader_refuses_them_too(tmp_path: Path, name: str) -> None:
     scene = tmp_path / "scene.xml"
     bodies = {

@@ -145,13 +145,22 @@ def test_some_triangles_without_area_are_noted(tmp_path: Path) -> None:
     assert "1 triangles have no area" in load_scene(write(tmp_path, sensor(), mesh, LIGHT)).notes[0]
 
 
-INSTANCES = f'<shape type="shapegroup" id="g">{FLOOR}</shape><shape type="instance"><ref id="g"/></shape>'
 REFUSED = {
     "no sensor": ([FLOOR, LIGHT], "must hold a sensor"),
     "no light": ([sensor(), FLOOR], "must hold a light"),
     "no shape": ([sensor(), LIGHT], "at least one shape"),
     "sensor type": ([sensor().replace('"perspective"', '"orthographic"'), FLOOR, LIGHT], "got orthographic"),
-    "instance": ([sensor(), INSTANCES, LIGHT], "must not be instances"),
+    "instance of nothing": ([sensor(), FLOOR, '<shape type="instance"/>', LIGHT], "one shapegroup, got 0"),
+    "group in a group": (
+        [
+            sensor(),
+            '<shape type="shapegroup" id="a"><shape type="shapegroup" id="b"/></shape>',
+            FLOOR,
+            '<shape type="instance"><ref id="a"/></shape>',
+            LIGHT,
+        ],
+        "plain shapes",
+    ),
     "unknown plugin": ([sensor(), '<shape type="pyramid"/>', LIGHT], "pyramid"),
     "unknown parameter": (
         [sensor(), FLOOR, '<emitter type="constant"><float name="glow" value="1"/></emitter>'],
