@@ -48,6 +48,17 @@ class _Walk:
     covered: "mi.Float"
     asked: "mi.Float"
 
+    @classmethod
+    def none(cls, width: int) -> "_Walk":
+        """Nothing gathered yet, on so many lanes."""
+        kinds = (mi.Color3f, mi.Color3f, mi.Vector3f, mi.Float, mi.Point3f, mi.Float, mi.Float)
+        return cls(*(dr.zeros(kind, width) for kind in kinds))
+
+    def scaled(self, share: float) -> "_Walk":
+        """A sum as a mean; position is no sum, and coverage needs `covered` and `asked` only by their ratio."""
+        return _Walk(self.radiance * share, self.albedo * share, self.normal * share, self.distance * share,
+                     self.position, self.covered, self.asked)  # fmt: skip
+
 
 class QueryProgram:
     """Caches of one scene, in device memory, and the program that queries them."""
@@ -104,7 +115,7 @@ class QueryProgram:
         lane = dr.arange(mi.UInt32, width * height)
         x, y = mi.Float(lane % width), mi.Float(lane // width)
         if self.settings.samples > 1 and not self.finds_edges:
-            return self._store(lane, self._average(device, x, y, width, height, self._num_places))
+            return self._store(lane, self._average(device, x, y, width, height))
         image = self._store(lane, self._walk(device.ray(x + 0.5, y + 0.5, width, height)))
         if self.finds_edges:
             edges = edge_pixels(image, width, height, NUM_CHANNELS)
@@ -112,44 +123,31 @@ class QueryProgram:
             self._refine(image, device, edges, width, height)
         return image
 
-    @dr.syntax
-    def _average(self, device, x, y, width: int, height: int, count: int):
-        radiance, albedo = dr.zeros(mi.Color3f, dr.width(x)), dr.zeros(mi.Color3f, dr.width(x))
-        normal, position = dr.zeros(mi.Vector3f, dr.width(x)), dr.zeros(mi.Point3f, dr.width(x))
-        distance = dr.zeros(mi.Float, dr.width(x))
-        covered, asked = dr.zeros(mi.Float, dr.width(x)), dr.zeros(mi.Float, dr.width(x))
-        index = mi.UInt32(0)
-        while index < count:
-            place = dr.gather(mi.Point2f, self._places, index)
-            walk = self._walk(device.ray(x + place.x, y + place.y, width, height))
-            radiance += walk.radiance
-            albedo += walk.albedo
-            normal += walk.normal
-            distance += walk.distance
-            covered += walk.covered
-            asked += walk.asked
-            position[index == 0] = walk.position
-            index += 1
-        scale = 1.0 / count
-        return _Walk(
-            radiance * scale, albedo * scale, normal * scale, distance * scale, position, covered, asked
-        )  # fmt: skip
+    def _average(self, device, x, y, width: int, height: int) -> _Walk:
+        """Mean over all sample places of each pixel; position is that of the first."""
+        total = self._add_samples(_Walk.none(dr.width(x)), device, x, y, mi.Bool(True), width, height, first=0)
+        return total.scaled(1.0 / self._num_places)
 
-    @dr.syntax
-    def _refine(self, image, device, pixel, width: int, height: int):
+    def _refine(self, image, device, pixel, width: int, height: int) -> None:
         """Averages further samples into some pixels of an image; the place of the first sample stays."""
         active = pixel < width * height
         pixel = dr.select(active, pixel, 0)
         x, y = mi.Float(pixel % width), mi.Float(pixel // width)
-        packets = NUM_CHANNELS // 4
-        first = [value for k in range(packets) for value in dr.gather(mi.Vector4f, image, pixel * packets + k, active)]
-        radiance, normal, albedo = mi.Color3f(first[0:3]), mi.Vector3f(first[3:6]), mi.Color3f(first[6:9])
-        distance, asked = mi.Float(first[9]), mi.Float(first[14])
-        covered = first[10] * asked
-        distance *= self.table.frame.scale
-        index = dr.zeros(mi.UInt32, dr.width(pixel))
+        first = self._load(image, pixel, active)
+        total = self._add_samples(first, device, x, y, active, width, height, first=-1)
+        mean = total.scaled(1.0 / (1 + self._num_places))
+        dr.scatter(image, mi.ArrayXf(self._channels(mean)), pixel, active)
+
+    @dr.syntax
+    def _add_samples(self, total: _Walk, device, x, y, active, width: int, height: int, first: int) -> _Walk:
+        """`total` and the walks through every sample place of a pixel, summed; position is that of the place with
+        index `first`, or `total`'s where none has it."""
+        radiance, normal, albedo = mi.Color3f(total.radiance), mi.Vector3f(total.normal), mi.Color3f(total.albedo)
+        distance, position = mi.Float(total.distance), mi.Point3f(total.position)
+        covered, asked = mi.Float(total.covered), mi.Float(total.asked)
+        index = dr.zeros(mi.Int32, dr.width(x))
         while active & (index < self._num_places):
-            place = dr.gather(mi.Point2f, self._places, index)
+            place = dr.gather(mi.Point2f, self._places, mi.UInt32(index))
             walk = self._walk(device.ray(x + place.x, y + place.y, width, height))
             radiance += walk.radiance
             albedo += walk.albedo
@@ -157,11 +155,21 @@ class QueryProgram:
             distance += walk.distance
             covered += walk.covered
             asked += walk.asked
+            position[index == first] = walk.position
             index += 1
-        scale = 1.0 / (1 + self._num_places)
-        position = mi.Point3f(first[11:14]) * self.table.frame.scale
-        mean = _Walk(radiance * scale, albedo * scale, normal * scale, distance * scale, position, covered, asked)
-        dr.scatter(image, mi.ArrayXf(self._channels(mean)), pixel, active)
+        return _Walk(radiance, albedo, normal, distance, position, covered, asked)
+
+    def _load(self, image, pixel, active) -> _Walk:
+        """What `_store` wrote."""
+        packets = NUM_CHANNELS // 4
+        values = [value for k in range(packets) for value in dr.gather(mi.Vector4f, image, pixel * packets + k, active)]
+        scale = self.table.frame.scale
+        asked = mi.Float(values[14])
+        return _Walk(
+            radiance=mi.Color3f(values[0:3]), albedo=mi.Color3f(values[6:9]), normal=mi.Vector3f(values[3:6]),
+            distance=mi.Float(values[9]) * scale, position=mi.Point3f(values[11:14]) * scale,
+            covered=values[10] * asked, asked=asked,
+        )  # fmt: skip
 
     def _store(self, pixel, walk: _Walk) -> "mi.Float":
         buffer = dr.empty(mi.Float, dr.width(pixel) * NUM_CHANNELS)
