@@ -1,6 +1,7 @@
-"""Benchmarks of scenes: measured one at a time, kept in the store as one JSON a scene, written as one page.
+"""Benchmarks of scenes: measured one at a time, kept as one JSON a scene, written as one page.
 
-    <store>/benchmarks/<scene>.json
+    <store>/benchmarks/<scene>.json     of the scenes measured in a store
+    docs/benchmarks/<scene>.json        beside the page: of all scenes on it, whichever store they were measured in
 
 A scene that is measured again replaces its record; an ablation that was not asked for again is kept, with the
 command, commit and machine that gave it.
@@ -9,6 +10,7 @@ command, commit and machine that gave it.
 import json
 import os
 import shlex
+import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,12 +18,13 @@ from typing import TYPE_CHECKING, Any
 
 from service.ablations import measure_ablation
 from service.benchmark_page import render_page
-from service.cost_curves import load_curves
+from service.cost_curves import copy_curves, load_curves
 from service.errors import ServiceError
 from service.options import write_file
 from service.outcome import json_values
 
 if TYPE_CHECKING:
+    from storage.durable import FileTree
     from storage.store import Store
     from workers.pipeline import Evaluation
     from workers.progress import Progress
@@ -111,24 +114,24 @@ def measure(
     result = evaluation.result
     record: Record = {
         "schema": SCHEMA, "scene": scene.name, "source": shown_path(request.source),
-        "digest": scene.digest, "command": request.command, "commit": result["commit"],
+        "digest": scene.digest, "command": request.command, "commit": result["commit"], "measured_at": _now(),
         "machine": result["machine"], "result": result,
         **measure_scene(scene, store, request.size, request.repeats, progress),
     }  # fmt: skip
-    record = merge(_read(store, record_file(scene.name)), record)
-    save(store, record)
+    record = merge(_read(store.files, record_file(scene.name)), record)
+    save(store.files, record)
     if request.ablate:
         ablation = measure_ablation(scene, store, settings, progress, request.command)
-        save(store, record | {"ablation": ablation})
+        save(store.files, record | {"ablation": ablation, "measured_at": _now()})
     return evaluation
 
 
 def keep_ablation(store: "Store", digest: str, ablation: Record) -> bool:
     """Puts an ablation beside the scene's record; False where the scene was not measured in this store."""
-    record = _read(store, record_file(ablation["scene"]))
+    record = _read(store.files, record_file(ablation["scene"]))
     if record is None or record["digest"] != digest:
         return False
-    save(store, record | {"ablation": ablation})
+    save(store.files, record | {"ablation": ablation, "measured_at": _now()})
     return True
 
 
@@ -152,14 +155,18 @@ def merge(previous: Record | None, record: Record) -> Record:
 # ------------------------------------------------- at rest -------------------------------------------------
 
 
+def _now() -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+
+
 def record_file(scene: str) -> str:
-    """Where a scene's record lies, relative to the store."""
+    """Where a scene's record lies, relative to a store or to the folder of the page."""
     return f"{FOLDER}/{scene}.json"
 
 
-def save(store: "Store", record: Record) -> None:
+def save(files: "FileTree", record: Record) -> None:
     """Writes a record, whole or not at all."""
-    store.files.write(record_file(record["scene"]), json_bytes(record))
+    files.write(record_file(record["scene"]), json_bytes(record))
 
 
 def json_bytes(value: Any) -> bytes:
@@ -167,19 +174,19 @@ def json_bytes(value: Any) -> bytes:
     return f"{json.dumps(json_values(value), indent=2, allow_nan=False)}\n".encode()
 
 
-def load_all(store: "Store") -> list[Record]:
-    """Every record of the store, by scene name.
+def load_all(files: "FileTree") -> list[Record]:
+    """Every record, by scene name.
 
     Raises:
         BenchmarkError: one cannot be read.
     """
-    names = [name for name in store.files.names(FOLDER) if name.endswith(".json")]
-    records = [_read(store, f"{FOLDER}/{name}") for name in names if not name.startswith(".")]
+    names = [name for name in files.names(FOLDER) if name.endswith(".json")]
+    records = [_read(files, f"{FOLDER}/{name}") for name in names if not name.startswith(".")]
     return sorted((record for record in records if record), key=lambda record: str(record["scene"]))
 
 
-def _read(store: "Store", file: str) -> Record | None:
-    data = store.files.read(file)
+def _read(files: "FileTree", file: str) -> Record | None:
+    data = files.read(file)
     if data is None:
         return None
     try:
@@ -189,14 +196,26 @@ def _read(store: "Store", file: str) -> Record | None:
     if not isinstance(record, dict) or record.get("schema") != SCHEMA:
         found = record.get("schema") if isinstance(record, dict) else "no JSON object"
         raise BenchmarkError(
-            f"benchmark record must be JSON of schema {SCHEMA}, got {found} in {store.files.path(file)}; "
+            f"benchmark record must be JSON of schema {SCHEMA}, got {found} in {files.path(file)}; "
             "delete it and measure the scene again"
         )
     return record
 
 
 def write_page(store: "Store", output: Path) -> int:
-    """Writes the page of all records of a store, cost curves last; returns how many scenes were measured."""
-    records = load_all(store)
-    write_file(output, render_page(records, load_curves(store)).encode())
+    """Writes the page of all records of a store and of those beside the page; returns how many scenes it shows.
+
+    Of two records of a scene the one measured later counts. All of them lie beside the page afterwards, so that a
+    scene can be measured again without the stores of the others.
+    """
+    from storage.durable import FileTree
+
+    beside = FileTree(output.absolute().parent)
+    known = {record["scene"]: record for record in load_all(beside)}
+    for record in load_all(store.files):
+        if record.get("measured_at", "") >= known.get(record["scene"], {}).get("measured_at", ""):
+            save(beside, record)
+    copy_curves(store.files, beside)
+    records = load_all(beside)
+    write_file(output, render_page(records, load_curves(beside)).encode())
     return len(records)

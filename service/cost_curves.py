@@ -1,9 +1,10 @@
 """Cost curves as people read them: a terminal table, the benchmarks page's section, and their records in the store.
 
-<store>/cost-curves/<scene>.json
+<store>/cost-curves/<scene>.json, and docs/cost-curves/<scene>.json beside the page
 """
 
 import json
+import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,7 @@ from service.outcome import json_values
 from service.scores import ABSENT, human_bytes, human_seconds
 
 if TYPE_CHECKING:
-    from storage.store import Store
+    from storage.durable import FileTree
 
 FOLDER = "cost-curves"
 SCHEMA = 1
@@ -119,33 +120,46 @@ def remarks(result: Mapping[str, Any]) -> list[str]:
 # -------------------------------------------------- at rest --------------------------------------------------
 
 
-def keep_curves(store: "Store", result: Mapping[str, Any], command: str) -> Record:
+def keep_curves(files: "FileTree", result: Mapping[str, Any], command: str) -> Record:
     """Keeps a scene's curves in place of older ones; returns the record."""
-    record = {"schema": SCHEMA, "scene": result["scene"], "command": command, "result": json_values(dict(result))}
-    text = json.dumps(record, indent=2, allow_nan=False)
-    store.files.write(f"{FOLDER}/{result['scene']}.json", f"{text}\n".encode())
+    record = {"schema": SCHEMA, "scene": result["scene"], "command": command, "result": json_values(dict(result)),
+              "measured_at": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())}  # fmt: skip
+    _write(files, record)
     return record
 
 
-def load_curves(store: "Store") -> list[Record]:
-    """Every record of the store, by scene name.
+def load_curves(files: "FileTree") -> list[Record]:
+    """Every record, by scene name.
 
     Raises:
         CostCurvesError: one cannot be read.
     """
-    names = [name for name in store.files.names(FOLDER) if name.endswith(".json") and not name.startswith(".")]
-    records = [_read(store, f"{FOLDER}/{name}") for name in names]
+    names = [name for name in files.names(FOLDER) if name.endswith(".json") and not name.startswith(".")]
+    records = [_read(files, f"{FOLDER}/{name}") for name in names]
     return sorted(records, key=lambda record: str(record["scene"]))
 
 
-def _read(store: "Store", file: str) -> Record:
+def copy_curves(source: "FileTree", target: "FileTree") -> None:
+    """Copies the records that `target` lacks or has from an earlier time."""
+    known = {record["scene"]: record for record in load_curves(target)}
+    for record in load_curves(source):
+        if record.get("measured_at", "") >= known.get(record["scene"], {}).get("measured_at", ""):
+            _write(target, record)
+
+
+def _write(files: "FileTree", record: Record) -> None:
+    text = json.dumps(record, indent=2, allow_nan=False)
+    files.write(f"{FOLDER}/{record['scene']}.json", f"{text}\n".encode())
+
+
+def _read(files: "FileTree", file: str) -> Record:
     try:
-        record = json.loads(store.files.read(file) or b"")
+        record = json.loads(files.read(file) or b"")
         if record["schema"] != SCHEMA:
             raise ValueError(f"schema {record['schema']}")
     except (ValueError, KeyError, TypeError) as error:
         raise CostCurvesError(
-            f"cost curves must be JSON of schema {SCHEMA}, got {error} in {store.files.path(file)}; "
+            f"cost curves must be JSON of schema {SCHEMA}, got {error} in {files.path(file)}; "
             "delete it and measure the scene again"
         ) from error
     found: Record = record

@@ -86,7 +86,7 @@ def cost_curves(
         show(cost_curves_table(result))
         if opened is not None:
             command = ["cost-curves", shown_path(scene), "--triangles", triangles, "--preset", preset]
-            keep_curves(opened, result, _shown(command, store or "", resolution, assignments, size, repeats))
+            keep_curves(opened.files, result, _shown(command, store or "", resolution, assignments, size, repeats))
         if outputs.json is not None:
             write_file(outputs.json, json_bytes(result))
         if plot_file is not None:

@@ -214,19 +214,19 @@ def test_merge_keeps_seconds_of_stages_that_were_resumed_with_the_same_settings(
 
 
 def test_records_survive_the_store_in_the_order_of_names(store: Store) -> None:
-    assert load_all(store) == []
+    assert load_all(store.files) == []
     for scene in ("hall", "ajar", "tabletop"):
-        save(store, make_record(scene))
-    assert load_all(store) == [make_record(scene) for scene in ("ajar", "hall", "tabletop")]
-    save(store, make_record("hall", commit="later"))
-    assert [record["commit"] for record in load_all(store)] == ["0123abc", "later", "0123abc"]
+        save(store.files, make_record(scene))
+    assert load_all(store.files) == [make_record(scene) for scene in ("ajar", "hall", "tabletop")]
+    save(store.files, make_record("hall", commit="later"))
+    assert [record["commit"] for record in load_all(store.files)] == ["0123abc", "later", "0123abc"]
 
 
 @pytest.mark.parametrize("content", [b"{", b"[]", b'{"schema": 0}'])
 def test_a_record_that_cannot_be_read_names_file_and_remedy(store: Store, content: bytes) -> None:
     store.files.write(record_file("hall"), content)
     with pytest.raises(BenchmarkError, match=r"benchmarks/hall\.json; delete it"):
-        load_all(store)
+        load_all(store.files)
 
 
 # -------------------------------------------------- page --------------------------------------------------
@@ -277,10 +277,10 @@ def test_keep_ablation_needs_a_record_of_the_same_scene(tmp_path: Path) -> None:
     store = Store.open(tmp_path, create=True)
     ablation = {"scene": "hall", "rows": [ablation_row("ours", 30.0, 32.0)]}
     assert not keep_ablation(store, "d1", ablation)
-    save(store, make_record())
+    save(store.files, make_record())
     assert not keep_ablation(store, "another digest", ablation)
     assert keep_ablation(store, "d1", ablation)
-    assert load_all(store)[0]["ablation"] == ablation
+    assert load_all(store.files)[0]["ablation"] == ablation
 
 
 def test_page_shows_the_ablation_with_its_own_command() -> None:
@@ -373,7 +373,7 @@ def test_benchmark_measures_scenes_one_at_a_time_and_keeps_them_all(calls: Any, 
 
 
 def test_benchmark_without_a_scene_only_writes_the_page(calls: Any, tmp_path: Path, store: Store) -> None:
-    save(store, make_record())
+    save(store.files, make_record())
     page = tmp_path / "benchmarks.md"
     result = invoke("benchmark", "--store", store.url, "--output", str(page))
     assert calls == [] and "measured scenes: 1" in result.stdout
@@ -391,7 +391,7 @@ def test_benchmark_keeps_the_run_when_its_ablation_fails(
     settings = Settings.preset_named("draft")
     with pytest.raises(ZeroDivisionError):
         measure(FakeScene(), store, settings, request, Progress())  # type: ignore[arg-type]
-    assert [record["scene"] for record in load_all(store)] == ["hall"]
+    assert [record["scene"] for record in load_all(store.files)] == ["hall"]
 
 
 def test_benchmark_adds_the_ablation_when_asked(calls: Any, tmp_path: Path) -> None:
@@ -430,5 +430,17 @@ def test_ablate_leaves_what_the_store_knows_of_a_scene(calls: Any, store: Store)
 
 def test_write_page_tells_how_many(store: Store, tmp_path: Path) -> None:
     assert write_page(store, tmp_path / "page.md") == 0
-    save(store, make_record())
+    save(store.files, make_record())
     assert write_page(store, tmp_path / "page.md") == 1
+
+
+def test_page_keeps_the_scenes_of_other_stores_and_the_later_record(tmp_path: Path) -> None:
+    stores = [Store.open(tmp_path / name, create=True) for name in ("one", "other")]
+    page = tmp_path / "docs" / "benchmarks.md"
+    save(stores[0].files, make_record("ajar"))
+    save(stores[0].files, make_record("hall", commit="first", measured_at="2026-01-01T00:00:00Z"))
+    save(stores[1].files, make_record("hall", commit="second", measured_at="2026-01-02T00:00:00Z"))
+    assert [write_page(store, page) for store in (*stores, stores[0])] == [2, 2, 2]
+    text = page.read_text()
+    assert "## ajar" in text and "Commit second" in text and "Commit first" not in text
+    assert sorted(file.name for file in (page.parent / "benchmarks").iterdir()) == ["ajar.json", "hall.json"]

@@ -71,8 +71,8 @@ def test_table_shows_rows_exponents_and_notes(result: dict[str, Any]) -> None:
 
 def test_record_returns_as_it_went_and_stands_on_the_page(result: dict[str, Any], tmp_path: Path) -> None:
     store = Store.open(tmp_path / "store", create=True)
-    keep_curves(store, result, "lightwell cost-curves hall")
-    (record,) = load_curves(store)
+    keep_curves(store.files, result, "lightwell cost-curves hall")
+    (record,) = load_curves(store.files)
     assert record["result"] == json.loads(json.dumps(result))
     assert store.verify() == []
     assert write_page(store, tmp_path / "page.md") == 0
@@ -93,7 +93,7 @@ def test_record_that_is_not_ours_is_named(data: bytes, tmp_path: Path) -> None:
     store = Store.open(tmp_path / "store", create=True)
     store.files.write(f"{FOLDER}/hall.json", data)
     with pytest.raises(CostCurvesError, match=r"hall\.json"):
-        load_curves(store)
+        load_curves(store.files)
 
 
 @pytest.mark.parametrize(("suffix", "start"), [(".png", b"\x89PNG"), (".svg", b"<?xml")])
@@ -128,7 +128,7 @@ def test_command_measures_keeps_and_writes(
     assert budget.triangles == (100, 200) and dict(budget.overrides) == {"cache.polar": "3"}
     assert json.loads(files["json"].read_text())["scene"] == "hall"
     assert files["png"].read_bytes().startswith(b"\x89PNG")
-    (record,) = load_curves(Store.open(tmp_path / "store"))
+    (record,) = load_curves(Store.open(tmp_path / "store").files)
     assert "--triangles 100,200" in record["command"] and str(tmp_path.parent) not in record["command"]
 
 
