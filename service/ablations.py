@@ -8,7 +8,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from service.scores import REFUSED, human_bytes, human_seconds
+from service.scores import ABSENT, REFUSED, human_bytes, human_seconds
 
 if TYPE_CHECKING:
     from storage.store import Store
@@ -17,10 +17,11 @@ if TYPE_CHECKING:
     from workers.settings import Settings
 
 HEAD = ("variant", "IR PSNR dB", "final PSNR dB", "against ours dB", "SSIM", "FLIP", "bake paths", "bake",
-        "caches")  # fmt: skip
+        "caches", "seen or not: paths", "caches")  # fmt: skip
 LEGEND = (
     "Every variant shares camera paths and references. A variant without a network is scored, and set "
-    "against ours, by its IR (marked *)."
+    "against ours, by its IR (marked *). Only what the cameras see is baked; the last columns are what caches on every "
+    "triangle would take."
 )
 OURS = "ours"
 
@@ -28,9 +29,10 @@ Row = Mapping[str, Any]
 
 
 def measure_ablation(
-    scene: "Scene", store: "Store", settings: "Settings", progress: "Progress", command: str
-) -> dict[str, Any]:
-    """Runs every variant; what the store has of them is not computed again.
+    scene: "Scene", store: "Store", settings: "Settings", progress: "Progress", command: str,
+    names: Sequence[str] = (),
+) -> dict[str, Any]:  # fmt: skip
+    """Runs the variants; what the store has of them is not computed again.
 
     Args:
         scene: the scene.
@@ -38,6 +40,10 @@ def measure_ablation(
         settings: ours; variants change parts of it.
         progress: told about it.
         command: the command line that asks for it.
+        names: rows to run; every one where none is given.
+
+    Raises:
+        WorkerError: a name is no row's.
 
     Returns:
         JSON: scene, width, height, preset, rows, command, commit, machine.
@@ -47,7 +53,7 @@ def measure_ablation(
 
     if all(entry["digest"] != scene.digest for entry in store.scenes()):
         store.register_scene(scene.digest, {"name": scene.name, "source": str(scene.source)})
-    rows = run_ablation(scene, store, settings, progress)
+    rows = run_ablation(scene, store, settings, progress, names)
     return {
         "scene": scene.name, "width": settings.width, "height": settings.height, "preset": settings.preset,
         "rows": rows, "command": command, "commit": commit(), "machine": machine(),
@@ -77,7 +83,13 @@ def _cells(row: Row, ours: Row | None) -> list[str]:
         f"{row['bake_paths'] / 1e6:.3g} M",
         human_seconds(row["bake_seconds"]),
         human_bytes(row["cache_nbytes"]),
+        _number(_in_millions(row.get("whole_paths")), "{:.3g} M", ABSENT),
+        human_bytes(row["whole_nbytes"]) if "whole_nbytes" in row else ABSENT,
     ]
+
+
+def _in_millions(count: float | None) -> float | None:
+    return None if count is None else count / 1e6
 
 
 def _number(number: float | None, pattern: str, absent: str = REFUSED) -> str:

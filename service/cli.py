@@ -183,6 +183,9 @@ def ablate(
     preset: PresetOption = "draft",
     resolution: ResolutionOption = None,
     assignments: SetOption = None,
+    rows: Annotated[
+        list[str] | None, typer.Option("--row", help="only this row, by its name; may be given again")
+    ] = None,
     json_file: JsonOption = None,
 ) -> None:
     """Train and measure the paper's choices and ours, one change at a time. Hours on a real scene."""
@@ -197,10 +200,11 @@ def ablate(
 
         loaded = _load(scene, resolution)
         settings = _settings(preset, loaded, assignments)
-        command = shown_command(["ablate", shown_path(scene)], store, preset, resolution, assignments or [])
+        rest = [word for row in rows or () for word in ("--row", row)]
+        command = shown_command(["ablate", shown_path(scene)], store, preset, resolution, assignments or [], rest)
         opened = Store.open(store, create=True)
         with RichProgress() as progress:
-            ablation = measure_ablation(loaded, opened, settings, progress, command)
+            ablation = measure_ablation(loaded, opened, settings, progress, command, rows or ())
         keep_ablation(opened, loaded.digest, ablation)
         show(ablation_table(ablation))
         if outputs.json is not None:

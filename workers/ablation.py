@@ -3,6 +3,7 @@
 Ground truth and camera paths are shared through the store; every variant bakes and trains what it needs.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,9 +16,11 @@ from workers.bake import bake_refs, cache_nbytes, load_caches, run_bake
 from workers.direction_grids import directional_cost
 from workers.element_stage import run_elements
 from workers.elements import ElementSet
+from workers.errors import WorkerError
 from workers.evaluate import load_reference, mean_score
 from workers.inputs import run_inputs
 from workers.network_record import load_network
+from workers.plan_stage import planned_run
 from workers.progress import Progress
 from workers.query import CHANNELS, QueryProgram
 from workers.reconstruct import Reconstructor
@@ -64,19 +67,39 @@ def variants(settings: Settings) -> list[Variant]:
         Variant("ours, perceptual only", {"train.l1_weight": 0.0, "train.perceptual_weight": 1.0}),
         Variant("ours, 1x1 query", {"query.samples": 1}),
         Variant("ours, 2x2 query everywhere", {"query.supersample": "everywhere"}),
+        Variant("ours, planned", {"plan.mode": "adaptive"}),
         Variant("ours", {}),
     ]  # fmt: skip
 
 
-def run_ablation(scene: Scene, store: Store, settings: Settings, progress: Progress) -> list[dict[str, Any]]:
-    """Runs every variant.
+def chosen_variants(settings: Settings, names: Sequence[str] = ()) -> list[Variant]:
+    """The rows that are named, in their own order; all of them where none is.
+
+    Raises:
+        WorkerError: a name is no row's.
+    """
+    rows = variants(settings)
+    known = [row.name for row in rows]
+    for name in names:
+        if name not in known:
+            raise WorkerError(f"ablation row must be one of {'; '.join(known)}, got {name!r}")
+    return [row for row in rows if not names or row.name in names]
+
+
+def run_ablation(
+    scene: Scene, store: Store, settings: Settings, progress: Progress, names: Sequence[str] = ()
+) -> list[dict[str, Any]]:
+    """Runs the variants that are named, every one where none is.
 
     Returns:
         A row each: name, ir_psnr, psnr, ssim, flip (of the final frame; of IR where no network is trained),
-        bake_paths, bake_seconds, cache_nbytes.
+        bake_paths, bake_seconds, cache_nbytes, and whole_paths and whole_nbytes (`bake_cost`).
+
+    Raises:
+        WorkerError: a name is no row's.
     """
     rows = []
-    for variant in variants(settings):
+    for variant in chosen_variants(settings, names):
         progress.message(f"ablation: {variant.name}")
         run = RunState(scene, store, settings.override(variant.overrides), progress)
         rows.append(_row(run, variant))
@@ -84,6 +107,7 @@ def run_ablation(scene: Scene, store: Store, settings: Settings, progress: Progr
 
 
 def _row(run: RunState, variant: Variant) -> dict[str, Any]:
+    run = planned_run(run)
     elements = run_elements(run)
     run_bake(run, elements)
     program = QueryProgram(run.scene.mi_scene, run.table, elements, load_caches(run, elements), run.settings.query)
@@ -114,6 +138,11 @@ def training_exposure(run: RunState, refs: list[UnitRef]) -> float:
 
 
 def bake_cost(run: RunState, elements: ElementSet) -> dict[str, float]:
+    """Paths, seconds and bytes of a run's bake.
+
+    `whole_paths` and `whole_nbytes` are those of a bake that does not ask what is seen: every (tessellated) triangle's
+    front, for caches a triangle; what was baked, for the others.
+    """
     cache = run.settings.cache
     diffuse = elements.num_elements * cache.diffuse_spp if cache.lobes == "split" else 0
     directional = directional_cost(elements, cache)["paths"]
@@ -122,4 +151,7 @@ def bake_cost(run: RunState, elements: ElementSet) -> dict[str, float]:
         caches = CacheSet.open(run.store, ref)
         records = [caches.unit_record(index) for index in range(caches.num_units)]
         seconds += sum(float(record["seconds"]) for record in records if record)
-    return {"bake_paths": diffuse + directional, "bake_seconds": seconds, "cache_nbytes": cache_nbytes(run, elements)}
+    paths, nbytes = diffuse + directional, cache_nbytes(run, elements)
+    unseen = elements.patches.num_patches / elements.num_elements if cache.elements == "triangle" else 1.0
+    return {"bake_paths": paths, "bake_seconds": seconds, "cache_nbytes": nbytes, "whole_paths": paths * unseen,
+            "whole_nbytes": nbytes * unseen}  # fmt: skip

@@ -337,9 +337,9 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Any]]:
         calls.append(("measure_scene", (size, repeats)))
         return json.loads(json.dumps(MEASURED))
 
-    def run_ablation(scene: Any, store: Store, settings: Any, progress: Any) -> list[dict[str, Any]]:
+    def run_ablation(scene: Any, store: Store, settings: Any, progress: Any, names: Any) -> list[dict[str, Any]]:
         calls.append(("run_ablation", [entry["name"] for entry in store.scenes()]))
-        return ABLATION_ROWS
+        return [row for row in ABLATION_ROWS if not names or row["name"] in names]
 
     contents = {
         "workers.scene": {"load_scene": load_scene},
@@ -420,6 +420,14 @@ def test_ablate_prints_the_table_and_writes_json(calls: Any, tmp_path: Path) -> 
     assert written["rows"] == ABLATION_ROWS
     assert (written["width"], written["height"], written["preset"]) == (24, 16, "draft")
     assert written["command"].startswith("lightwell ablate hall.xml --store ")
+
+
+def test_ablate_takes_the_rows_that_are_named(calls: Any, store: Store, tmp_path: Path) -> None:
+    file = tmp_path / "rows.json"
+    invoke("ablate", "hall.xml", "--store", store.url, "--row", "ours", "--json", str(file))
+    written = json.loads(file.read_text())
+    assert [row["name"] for row in written["rows"]] == ["ours"]
+    assert written["command"].endswith("--row ours")
 
 
 def test_ablate_leaves_what_the_store_knows_of_a_scene(calls: Any, store: Store) -> None:
