@@ -13,7 +13,7 @@ from models.metrics import exposure_from_luminance, luminance, score_frame
 from storage.caches import CacheSet
 from storage.store import Store, UnitRef
 from workers.bake import bake_refs, cache_nbytes, load_caches, run_bake
-from workers.direction_grids import directional_cost
+from workers.bake_lobes import lobes_of
 from workers.element_stage import run_elements
 from workers.elements import ElementSet
 from workers.errors import WorkerError
@@ -143,15 +143,13 @@ def bake_cost(run: RunState, elements: ElementSet) -> dict[str, float]:
     `whole_paths` and `whole_nbytes` are those of a bake that does not ask what is seen: every (tessellated) triangle's
     front, for caches a triangle; what was baked, for the others.
     """
-    cache = run.settings.cache
-    diffuse = elements.num_elements * cache.diffuse_spp if cache.lobes == "split" else 0
-    directional = directional_cost(elements, cache)["paths"]
-    seconds = 0.0
+    cache, seconds = run.settings.cache, 0.0
     for ref in bake_refs(run, elements).values():
         caches = CacheSet.open(run.store, ref)
         records = [caches.unit_record(index) for index in range(caches.num_units)]
         seconds += sum(float(record["seconds"]) for record in records if record)
-    paths, nbytes = diffuse + directional, cache_nbytes(run, elements)
+    paths = cache.passes * sum(len(lobe.owners) * lobe.lanes_per_element for lobe in lobes_of(run, elements))
+    nbytes = cache_nbytes(run, elements)
     unseen = elements.patches.num_patches / elements.num_elements if cache.elements == "triangle" else 1.0
     return {"bake_paths": paths, "bake_seconds": seconds, "cache_nbytes": nbytes, "whole_paths": paths * unseen,
             "whole_nbytes": nbytes * unseen}  # fmt: skip

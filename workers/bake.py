@@ -12,17 +12,17 @@ import numpy as np
 from storage.caches import CacheSet
 from storage.store import UnitRef
 from workers.bake_kernels import Batch
-from workers.bake_lobes import DIFFUSE, Lobe, lobes_of
-from workers.cache_filter import filter_diffuse, filter_directional
+from workers.bake_lobes import DIFFUSE, STAGE, TRACED, Lobe, lobes_of
+from workers.cache_filter import filter_directional
 from workers.direction_grids import choose_grids
 from workers.elements import ElementSet
 from workers.errors import QuarantinedError
+from workers.gather import load_diffuse
 from workers.lobes import reflectance_at
 from workers.query import CacheArrays
 from workers.run_state import RunState
 from workers.texels import DirectionalTexels, Packing, unpack_rows
 
-STAGE = "bake"
 LANES_PER_LAUNCH = 1 << 21
 MAX_NON_FINITE_SHARE = 1e-4
 
@@ -61,11 +61,13 @@ class BakeSet:
         ref: its address.
         num_units: bake units.
         lanes_per_unit: paths of one unit, all passes.
+        after: the set that must be sealed before; "" for none.
     """
 
     ref: UnitRef
     num_units: int
     lanes_per_unit: int
+    after: str = ""
 
 
 def bake_sets(run: RunState, elements: ElementSet) -> dict[str, BakeSet]:
@@ -73,7 +75,7 @@ def bake_sets(run: RunState, elements: ElementSet) -> dict[str, BakeSet]:
     per_unit, passes = run.settings.cache.elements_per_unit, run.settings.cache.passes
     return {
         lobe.name: BakeSet(run.ref(STAGE, lobe.params), -(-len(lobe.owners) // per_unit),
-                           lobe.lanes_per_element * per_unit * passes)
+                           lobe.lanes_per_element * per_unit * passes, lobe.after)
         for lobe in lobes_of(run, elements)
     }  # fmt: skip
 
@@ -178,25 +180,18 @@ def load_caches(run: RunState, elements: ElementSet) -> CacheArrays:
         StorageError: a unit is missing or damaged.
     """
     cache = run.settings.cache
-    lobes = {lobe.name: lobe for lobe in lobes_of(run, elements)}
+    lobes = {lobe.name: lobe for lobe in lobes_of(run, elements) if lobe.name != TRACED}
     diffuse = np.zeros((0, 3), np.float32)
     if DIFFUSE in lobes:
-        diffuse = _load_diffuse(run, elements, _stored(run, lobes.pop(DIFFUSE)).load())
+        diffuse = load_diffuse(run, elements, run.ref(STAGE, lobes.pop(DIFFUSE).params))
+        if not cache.demodulate:
+            diffuse = diffuse * reflectance_at(run.table, elements)
     directional = _load_directional(run, elements, list(lobes.values()))
     return CacheArrays(diffuse, directional, demodulated=cache.demodulate, exitant=cache.lobes == "exitant")
 
 
 def _stored(run: RunState, lobe: Lobe) -> CacheSet:
     return CacheSet.open(run.store, run.ref(STAGE, lobe.params))
-
-
-def _load_diffuse(run: RunState, elements: ElementSet, loaded: dict[str, np.ndarray]) -> np.ndarray:
-    cache, diffuse = run.settings.cache, loaded["mean"]
-    if cache.denoise:
-        square = loaded["square"].astype(np.float64)
-        variance = np.maximum(square - diffuse.astype(np.float64) ** 2, 0.0) / max(cache.diffuse_spp - 1, 1)
-        diffuse = filter_diffuse(elements, diffuse, np.sqrt(variance))
-    return diffuse if cache.demodulate else diffuse * reflectance_at(run.table, elements)
 
 
 def _load_directional(run: RunState, elements: ElementSet, lobes: list[Lobe]) -> DirectionalTexels:

@@ -7,6 +7,7 @@ bake bit-identical when it is run again.
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +16,9 @@ from workers.elements import ElementSet
 from workers.lobes import LobeClass, directional_lobes, has, specular_tint
 from workers.surfaces import SurfaceTable
 from workers.transport import CachedLobes, exitant_start, incident_radiance, lambertian_start
+
+if TYPE_CHECKING:
+    from workers.gather import DiffuseGather
 
 GRAZING_COSINE = 0.02  # directions below are baked at this cosine: a surface seen edge-on shows nothing
 
@@ -82,9 +86,9 @@ def _block_mean(value: "mi.Color3f", block: int) -> np.ndarray:
 
 def bake_diffuse(
     mi_scene: "mi.Scene", table: SurfaceTable, elements: ElementSet, batch: Batch, spp: int, bake_pass: int,
-    max_depth: int,
+    max_depth: int, gather: "DiffuseGather | None" = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Irradiance over pi of a batch: D in L_diffuse = rho_d * D.
+    """Irradiance over pi of a batch: D in L_diffuse = rho_d * D; `gather` as in `bake_directional`.
 
     Returns:
         (mean, mean of squares), float32 [n, 3] each, linear radiance.
@@ -92,7 +96,7 @@ def bake_diffuse(
     si, normal, _, sample = _interactions(table, elements, batch, spp)
     rng = _streams(batch, spp, bake_pass)
     direct, start = lambertian_start(mi_scene, si, normal, rng, _stratum(sample, spp, rng))
-    value = direct + incident_radiance(mi_scene, start, rng, max_depth)
+    value = direct + incident_radiance(mi_scene, start, rng, max_depth, gather)
     dr.eval(value)
     return _block_mean(value, spp), _block_mean(dr.square(value), spp)
 
@@ -108,7 +112,7 @@ def _stratum(sample: "mi.UInt32", spp: int, rng: "mi.PCG32") -> "mi.Point2f":
 
 def bake_directional(
     mi_scene: "mi.Scene", table: SurfaceTable, elements: ElementSet, batch: Batch, grid: tuple[int, int],
-    spp: int, bake_pass: int, max_depth: int, exitant: bool,
+    spp: int, bake_pass: int, max_depth: int, exitant: bool, gather: "DiffuseGather | None" = None,
 ) -> np.ndarray:  # fmt: skip
     """Exitant radiance by direction of a batch.
 
@@ -123,6 +127,7 @@ def bake_directional(
         max_depth: longest path (camera's count).
         exitant: all of the exitant radiance, emission and delta lobes included (the paper); else the directional
             lobe divided by its tint, without the diffuse lobe.
+        gather: diffuse caches that end paths (`workers/gather.py`); None: paths end by themselves.
 
     Returns:
         float32 [n, polar, azimuth, 3].
@@ -144,7 +149,7 @@ def bake_directional(
         lobes = CachedLobes(*directional_lobes(si, bits, table.lobe_union), False, whole)
         direct, start = exitant_start(mi_scene, si, lobes, rng)
         tint = specular_tint(si.bsdf(), si, bits, table.lobe_union, everything)
-    value = (direct + incident_radiance(mi_scene, start, rng, max_depth)) / tint
+    value = (direct + incident_radiance(mi_scene, start, rng, max_depth, gather)) / tint
     return _block_mean(value, spp).reshape(len(batch.element), polar, azimuth, 3)
 
 

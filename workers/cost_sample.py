@@ -19,12 +19,13 @@ import numpy as np
 from storage.caches import CacheSet
 from storage.keys import seed_from_key
 from storage.store import Store
-from workers.bake import LANES_PER_LAUNCH, BakeSet, bake_sets, bake_units
+from workers.bake import LANES_PER_LAUNCH, BakeSet, bake_refs, bake_sets, bake_units
 from workers.camera_path import domain_poses
 from workers.element_stage import RAYS_PER_POSE, elements_ref, run_elements
 from workers.elements import ElementSet
 from workers.errors import WorkerError
 from workers.footprint import geometry_nbytes, program_nbytes
+from workers.gather import DiffuseGather
 from workers.query import CacheArrays, QueryProgram
 from workers.run_state import PATH_SEED, RunState
 from workers.scene import load_scene
@@ -198,6 +199,11 @@ def _sampled_bake(
     The first launch is baked twice: its first time compiles.
     """
     cache = run.settings.cache
+    if found.after:
+        # Sampled like this one: the caches that end its paths are not whole, and their values cost nothing.
+        run.made[bake_refs(run, elements)[found.after].key] = DiffuseGather.of_nothing(
+            run.scene.mi_scene, run.table, elements
+        )
     group = max(1, LANES_PER_LAUNCH // max(found.lanes_per_unit // cache.passes, 1))
     blocks = [range(first, min(first + group, found.num_units)) for first in range(0, found.num_units, group)]
     wanted = max(NUM_BLOCKS, -(-request.sample_paths // (group * found.lanes_per_unit)))
@@ -213,7 +219,7 @@ def _sampled_bake(
         bake_units(run, elements, lobe, blocks[index])
         rates.append((time.perf_counter() - start) / len(blocks[index]))
         num_baked += len(blocks[index])
-    rows = len(elements.glossy) if lobe == "directional" else elements.num_elements
+    rows = len(elements.glossy) if lobe == "directional" else len(elements.diffuse)
     lanes_per_row = found.lanes_per_unit // cache.elements_per_unit
     weights = np.array([len(blocks[index]) for index in chosen], np.float64)
     seconds = found.num_units * float(np.average(rates, weights=weights))

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from workers.backend import dr, mi
-from workers.lobes import LobeClass, context, directional_lobes, has
+from workers.lobes import SMOOTH_MASK, LobeClass, context, directional_lobes, has
 from workers.settings import CacheSettings
 from workers.surfaces import SurfaceTable
 
@@ -182,7 +182,7 @@ def _sample_lobe(
     bs, value = si.bsdf().sample(ctx, si, one, mi.Point2f(two, three))
     if union & LobeClass.WHOLE:
         whole = has(bits, LobeClass.WHOLE)
-        smooth = context(int(mi.BSDFFlags.Smooth | mi.BSDFFlags.Null))
+        smooth = context(SMOOTH_MASK)
         every = si.bsdf().sample(smooth, si, one, mi.Point2f(two, three), whole)
         bs, value = (dr.select(whole, a, b) for a, b in zip(every, (bs, value), strict=True))
     cosine = dr.maximum(bs.wo.z * dr.sign(si.wi.z), 0.0)

@@ -8,7 +8,7 @@ from workers.backend import dr, mi
 from workers.camera import Camera
 from workers.elements import NO_SLOT, NOT_BAKED, ElementSet
 from workers.lattice import locate_patch, locate_points
-from workers.lobes import diffuse_reflectance
+from workers.lobes import diffuse_reflectance, shown_albedo, specular_tint
 from workers.surfaces import SurfaceTable
 from workers.visibility import Hits, pose_rays
 
@@ -74,7 +74,8 @@ def _first_hits(mi_scene: "mi.Scene", table: SurfaceTable, ray: "mi.Ray3f") -> t
     hit = si.is_valid()
     shape = table.shape_index(si, hit)
     bits = dr.gather(mi.UInt32, table.lobe_bits_dr, shape, hit)
-    albedo = dr.clip(diffuse_reflectance(si.bsdf(), si, bits, table.lobe_union, hit), 0.0, 1.0)
+    rho, tint = (read(si.bsdf(), si, bits, table.lobe_union, hit) for read in (diffuse_reflectance, specular_tint))
+    albedo = dr.clip(shown_albedo(rho, tint, bits, table.lobe_union), 0.0, 1.0)
     normal = si.sh_frame.n * dr.sign(-dr.dot(si.n, ray.d))
     index = dr.select(hit, shape, len(table.shapes))
     distance = si.t / table.frame.scale

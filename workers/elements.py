@@ -79,6 +79,12 @@ class ElementSet:
     def num_elements(self) -> int:
         return len(self.shape)
 
+    @property
+    def diffuse(self) -> np.ndarray:
+        """Indices of the elements with a diffuse lobe, int64 [d]: others need none of its paths."""
+        own = self.diffuse_slot[(self.diffuse_slot & NOT_BAKED) == 0]  # NO_SLOT has the bit, too
+        return np.unique(own).astype(np.int64)
+
 
 @dataclass(frozen=True)
 class _Lattice:

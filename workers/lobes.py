@@ -21,6 +21,15 @@ from workers.backend import dr, mi
 PROBE_COSINE = 0.5
 PROBE_SINE = float(np.sqrt(1 - PROBE_COSINE**2))
 MIN_TINT = 0.02
+TINT_SPREAD = 0.02  # a tint that changes less over a surface is left in the cache
+TINT_PROBES = 1024
+# First random numbers that pick the lobes of a material whose lobes cannot be told apart.
+TINT_LOBES = (0.125, 0.375, 0.625, 0.875)
+
+
+# Null: without it a `mask` material samples nothing but its hole; what hits the hole is dropped as delta.
+DIRECTIONAL_MASK = int(mi.BSDFFlags.Glossy | mi.BSDFFlags.DiffuseTransmission | mi.BSDFFlags.Null)
+SMOOTH_MASK = int(mi.BSDFFlags.Smooth | mi.BSDFFlags.Null)
 
 
 class LobeClass(IntFlag):
@@ -34,6 +43,7 @@ class LobeClass(IntFlag):
     EMITTER = 32
     FRONT_ONLY = 64  # a principled material that is black from behind
     WHOLE = 128  # masks tear its diffuse lobe apart: the directional cache takes every non-delta lobe
+    TINTED = 256  # its directionally cached lobe changes colour over the surface: the colour is divided out
 
 
 def context(mask: int) -> "mi.BSDFContext":
@@ -57,10 +67,13 @@ def classify_bsdf(bsdf: "mi.BSDF", *, is_emitter: bool = False) -> LobeClass:
     if bsdf.has_attribute("base_color") and bsdf.has_attribute("metallic"):
         return lobe | LobeClass.PRINCIPLED | (LobeClass(0) if _reflects_behind(bsdf) else LobeClass.FRONT_ONLY)
     if lobe & LobeClass.DIFFUSE and (not glossy or _is_maskable(bsdf)):
-        return lobe | LobeClass.MASKABLE
-    # A diffuse part that cannot be told apart from the rest is left in the directional lobe.
-    whole = lobe & ~LobeClass.DIFFUSE | LobeClass.GLOSSY | LobeClass.WHOLE
-    return whole if lobe & LobeClass.DIFFUSE else lobe
+        lobe |= LobeClass.MASKABLE
+    elif lobe & LobeClass.DIFFUSE:
+        # A diffuse part that cannot be told apart from the rest is left in the directional lobe.
+        lobe = lobe & ~LobeClass.DIFFUSE | LobeClass.GLOSSY | LobeClass.WHOLE
+    if lobe & LobeClass.GLOSSY and _is_tinted(bsdf, lobe):
+        lobe |= LobeClass.TINTED
+    return lobe
 
 
 def _reflects_behind(bsdf: "mi.BSDF") -> bool:
@@ -78,6 +91,21 @@ def _is_maskable(bsdf: "mi.BSDF") -> bool:
     diffuse, glossy, everything = (np.array(bsdf.eval(context(part), si, wo)) for part in parts)
     separate = bool(np.any(np.abs(diffuse - everything) > 1e-4 * np.abs(everything) + 1e-9))
     return separate and bool(np.allclose(diffuse + glossy, everything, rtol=1e-3, atol=1e-6))
+
+
+def _is_tinted(bsdf: "mi.BSDF", lobe: LobeClass) -> bool:
+    """Whether the tint differs between random places of the texture."""
+    if not any(key.endswith("to_uv") for key in mi.traverse(bsdf).keys()):  # noqa: SIM118  # it yields pairs
+        return False
+    rng = np.random.default_rng(0)
+    si = dr.zeros(mi.SurfaceInteraction3f, TINT_PROBES)
+    si.uv = mi.Point2f(rng.random((2, TINT_PROBES), dtype=np.float32))
+    si.n, si.dp_du, si.dp_dv = mi.Normal3f(0, 0, 1), mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+    si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
+    si.wi = mi.Vector3f(0, 0, 1)
+    bits = dr.full(mi.UInt32, int(lobe), TINT_PROBES)
+    tint = np.array(_sampled_tint(mi.BSDFPtr(bsdf), si, bits, lobe, mi.Bool(True)))
+    return bool(np.any(np.ptp(tint, axis=1) > TINT_SPREAD * tint.max()))
 
 
 def has(bits: "mi.UInt32", lobe: LobeClass) -> "mi.Bool":
@@ -134,9 +162,14 @@ def specular_tint(
 ) -> "mi.Color3f":
     """t_s(x, wo): the colour by which the directional lobe is divided in the cache; 1 where it has none.
 
-    Schlick's Fresnel of a principled material (its metals take their colour from a texture).
+    Schlick's Fresnel of a principled material (its metals take their colour from a texture); of another one whose
+    colour changes over the surface, what it reflects of a viewer along the normal. The split is exact for any tint, as
+    long as cache and pixel agree on it; a good one keeps textures out of the cache.
     """
     tint = dr.full(mi.Color3f, 1.0, dr.width(si))
+    if union & LobeClass.TINTED:
+        tinted = active & has(bits, LobeClass.TINTED)
+        tint = dr.select(tinted, _sampled_tint(bsdf, si, bits, union, tinted), tint)
     if union & LobeClass.PRINCIPLED:
         principled = active & has(bits, LobeClass.PRINCIPLED)
         base, metallic, transmission = principled_parameters(bsdf, si, principled)
@@ -146,6 +179,29 @@ def specular_tint(
         value = dr.lerp(value, mi.Color3f(1.0), transmission)
         tint = dr.select(principled, value, tint)
     return tint
+
+
+def _sampled_tint(
+    bsdf: "mi.BSDFPtr", si: "mi.SurfaceInteraction3f", bits: "mi.UInt32", union: LobeClass, active: "mi.Bool"
+) -> "mi.Color3f":
+    """Weight of the lobe's middle sample for a viewer along the normal: its reflectance, whatever its roughness."""
+    probe = mi.SurfaceInteraction3f(si)
+    probe.wi = mi.Vector3f(0.0, 0.0, dr.select(si.wi.z < 0, -1.0, 1.0))
+    middle = mi.Point2f(0.5)
+    _, weight = bsdf.sample(context(DIRECTIONAL_MASK), probe, mi.Float(0.5), middle, active)
+    if union & LobeClass.WHOLE:
+        whole, total = active & has(bits, LobeClass.WHOLE), dr.zeros(mi.Color3f, dr.width(si))
+        for pick in TINT_LOBES:
+            total += bsdf.sample(context(SMOOTH_MASK), probe, mi.Float(pick), middle, whole)[1]
+        weight = dr.select(whole, total / len(TINT_LOBES), weight)
+    return dr.clip(dr.select(dr.isfinite(weight), weight, 1.0), MIN_TINT, 1.0)
+
+
+def shown_albedo(rho: "mi.Color3f", tint: "mi.Color3f", bits: "mi.UInt32", union: LobeClass) -> "mi.Color3f":
+    """Albedo for the G-buffer: diffuse reflectance, and the tint of materials that show a texture by it."""
+    if not union & LobeClass.TINTED:
+        return rho
+    return rho + dr.select(has(bits, LobeClass.TINTED), tint, 0.0)
 
 
 def directional_lobes(
@@ -161,9 +217,7 @@ def directional_lobes(
     removed = mi.Color3f(0.0)
     if union & LobeClass.PRINCIPLED:
         removed = diffuse_reflectance(si.bsdf(), si, bits, LobeClass.PRINCIPLED, principled)
-    # Null: without it a `mask` material samples nothing but its hole; what hits the hole is dropped as delta.
-    mask = mi.BSDFFlags.Glossy | mi.BSDFFlags.DiffuseTransmission | mi.BSDFFlags.Null
-    return context(int(mask)), removed
+    return context(DIRECTIONAL_MASK), removed
 
 
 def reflectance_at(table, elements) -> np.ndarray:

@@ -24,12 +24,13 @@ from models.metrics import luminance
 from workers.backend import dr, mi
 from workers.bake_kernels import Batch, bake_diffuse, bake_directional, direction_in_bin
 from workers.elements import ElementSet
+from workers.gather import DiffuseGather, gathers
 from workers.lobes import diffuse_reflectance, specular_tint
 from workers.settings import CacheSettings
 from workers.surfaces import SurfaceTable
 
 # Part of the keys of what a plan decides; raise it whenever the same scene and settings give another pilot.
-PILOT_VERSION = 1
+PILOT_VERSION = 2
 NUM_PLAIN = 192
 NUM_DIRECTIONAL = 96
 DIFFUSE_SPP = 256
@@ -141,10 +142,11 @@ class _PilotBake:
     def __init__(self, mi_scene: "mi.Scene", table: SurfaceTable, elements: ElementSet, hits: np.ndarray,
                  cache: CacheSettings, max_depth: int, seed: int) -> None:  # fmt: skip
         self.scene, self.table, self.elements, self.hits = mi_scene, table, elements, hits
-        self.exitant, self.max_depth, self.seed = cache.lobes == "exitant", max_depth, seed
+        self.cache, self.exitant, self.max_depth, self.seed = cache, cache.lobes == "exitant", max_depth, seed
         self.rng = np.random.default_rng(seed)
         self.paths = 0
         self.samples: dict[str, list[np.ndarray]] = {}
+        self.known: list[tuple[np.ndarray, np.ndarray]] = []  # elements and their D
 
     def run(self) -> Pilot:
         every = np.arange(self.elements.num_elements)
@@ -192,19 +194,29 @@ class _PilotBake:
         self.paths += len(chosen) * DIFFUSE_SPP
         self.samples.setdefault("diffuse", []).extend([mean, square])
         mean, square = _finite(mean), _finite(square)
+        self.known.append((chosen, mean))
         return mean, np.maximum(square - mean**2, 0.0) * DIFFUSE_SPP / (DIFFUSE_SPP - 1)
 
     def _directional(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(S, variance of one path of it), [n, views, 3]. Every path is an element of its own in the launch."""
         batch = self._batch(np.repeat(chosen, DIRECTIONAL_SPP), 1000)
         rows = bake_directional(
-            self.scene, self.table, self.elements, batch, GRID, 1, 0, self.max_depth, self.exitant
+            self.scene, self.table, self.elements, batch, GRID, 1, 0, self.max_depth, self.exitant, self._gather()
         )  # fmt: skip
         self.paths += len(batch.element) * GRID[0] * GRID[1]
         paths = _finite(rows.reshape(len(chosen), DIRECTIONAL_SPP, -1, 3))
         mean = paths.mean(axis=1)
         self.samples["directional"] = [mean.reshape(len(chosen), GRID[1], GRID[0], 3).astype(np.float32)]
         return mean, paths.var(axis=1, ddof=1)
+
+    def _gather(self) -> DiffuseGather | None:
+        """Ends of paths as the bake will have them, with the pilot's own D: every element takes the nearest one's."""
+        elements = self.elements
+        if not gathers(self.cache, self.max_depth, elements):
+            return None
+        chosen, values = (np.concatenate(parts) for parts in zip(*self.known, strict=True))
+        nearest = cKDTree(elements.position[chosen]).query(elements.position)[1]
+        return DiffuseGather(self.scene, self.table, elements, values[nearest].astype(np.float32))
 
     def _colours(self, chosen: np.ndarray, *, directional: bool) -> tuple[np.ndarray, np.ndarray]:
         """(diffuse reflectance, tint of the directional lobe) by view, [n, views, 3]."""

@@ -17,9 +17,11 @@ from models.perceptual import MIN_SIZE_PX, StLpips
 from models.transfer import Transfer
 from storage.perceptual_weights import find_stlpips
 from workers.bake_kernels import bake_diffuse, bake_directional
+from workers.bake_lobes import DIFFUSE, GATHERED_SHARE, TRACED, TRACED_SHARE
 from workers.benchmark import spread_batch
 from workers.direction_grids import grid_shares
 from workers.elements import ElementSet
+from workers.gather import DiffuseGather, gathers
 from workers.pathtrace import flush, trace
 from workers.pilot import Pilot
 from workers.plan import StageCost
@@ -44,6 +46,7 @@ class Rates:
     Attributes:
         elements_s: seconds of placing elements, from this very plan.
         diffuse, directional: element paths a second; 0 where there is no such lobe.
+        gathered: of diffuse paths that end in caches; 0 where none do.
         frames: camera paths a second.
         step_s: seconds of one training step, by widths of the network.
     """
@@ -53,6 +56,7 @@ class Rates:
     directional: float
     frames: float
     step_s: dict[tuple[int, ...], float]
+    gathered: float = 0.0
 
 
 def calibrate(run: RunState, elements: ElementSet, widths: set[tuple[int, ...]], elements_s: float) -> Rates:
@@ -64,20 +68,20 @@ def calibrate(run: RunState, elements: ElementSet, widths: set[tuple[int, ...]],
         widths: networks that may be trained.
         elements_s: seconds that placing the elements took.
     """
-    cache, scene = run.settings.cache, run.scene
-    diffuse = directional = 0.0
-    if cache.lobes == "split" and elements.num_elements:
-        spp = min(cache.diffuse_spp, max(1, CALIBRATION_PATHS // min(cache.elements_per_unit, elements.num_elements)))
-        batch = spread_batch(np.arange(elements.num_elements), cache.elements_per_unit, spp, CALIBRATION_PATHS)
-        diffuse = len(batch.element) * spp / _warm_seconds(
-            lambda index: bake_diffuse(scene.mi_scene, run.table, elements, batch, spp, index, scene.max_depth)
-        )  # fmt: skip
+    cache, scene, gather = run.settings.cache, run.scene, None
+    diffuse = directional = gathered = 0.0
+    if gathers(cache, scene.max_depth, elements):
+        gather = DiffuseGather.of_nothing(scene.mi_scene, run.table, elements)
+    if cache.lobes == "split" and len(elements.diffuse):
+        diffuse = _diffuse_rate(run, elements, None)
+        gathered = 0.0 if gather is None else _diffuse_rate(run, elements, gather)
     if len(elements.glossy):
         grid = (cache.azimuth, cache.polar)
-        batch_s = spread_batch(elements.glossy, cache.elements_per_unit, grid[0] * grid[1], CALIBRATION_PATHS)
+        glossy = spread_batch(elements.glossy, cache.elements_per_unit, grid[0] * grid[1], CALIBRATION_PATHS)
         exitant = cache.lobes == "exitant"
-        directional = len(batch_s.element) * grid[0] * grid[1] / _warm_seconds(lambda index: bake_directional(
-            scene.mi_scene, run.table, elements, batch_s, grid, 1, index, scene.max_depth, exitant))  # fmt: skip
+        seconds = _warm_seconds(lambda index: bake_directional(
+            scene.mi_scene, run.table, elements, glossy, grid, 1, index, scene.max_depth, exitant, gather))  # fmt: skip
+        directional = len(glossy.element) * grid[0] * grid[1] / seconds
     edge = CALIBRATION_EDGE_PX
     camera = scene.camera.resized(min(run.settings.width, edge), min(run.settings.height, edge))
     spp_frames = max(1, CALIBRATION_PATHS // (camera.width * camera.height))
@@ -85,7 +89,22 @@ def calibrate(run: RunState, elements: ElementSet, widths: set[tuple[int, ...]],
         lambda index: trace(scene, camera, spp_frames, index)
     )  # fmt: skip
     step_s = {shape: step_seconds(run.settings.override({"train.widths": shape})) for shape in sorted(widths)}
-    return Rates(elements_s=elements_s, diffuse=diffuse, directional=directional, frames=frames, step_s=step_s)
+    return Rates(elements_s=elements_s, diffuse=diffuse, directional=directional, frames=frames, step_s=step_s,
+                 gathered=gathered)  # fmt: skip
+
+
+def _diffuse_rate(run: RunState, elements: ElementSet, gather: DiffuseGather | None) -> float:
+    """Paths a second of the diffuse lobe's bake."""
+    cache, scene, owners = run.settings.cache, run.scene, elements.diffuse
+    spp = min(cache.diffuse_spp, max(1, CALIBRATION_PATHS // min(cache.elements_per_unit, len(owners))))
+    batch = spread_batch(owners, cache.elements_per_unit, spp, CALIBRATION_PATHS)
+    return (
+        len(batch.element)
+        * spp
+        / _warm_seconds(
+            lambda index: bake_diffuse(scene.mi_scene, run.table, elements, batch, spp, index, scene.max_depth, gather)
+        )
+    )
 
 
 def _warm_seconds(launch) -> float:
@@ -102,10 +121,11 @@ def stage_costs(settings: Settings, elements: ElementSet, rates: Rates, pilot: P
     cache, frames = settings.cache, settings.frames
     pixels = settings.width * settings.height
     costs = [StageCost(stage="elements", paths=0, seconds=rates.elements_s, note="as in this plan")]
-    for one in _sets(settings, elements, pilot):
+    for one in _sets(settings, elements, pilot, gathering=rates.gathered > 0):
         per_pass = -(-one.spp // cache.passes)
         paths = one.rows * one.directions * per_pass * cache.passes
-        rate = rates.diffuse if one.name == "diffuse" else rates.directional
+        of_diffuse = {DIFFUSE: rates.gathered or rates.diffuse, TRACED: rates.diffuse}
+        rate = of_diffuse.get(one.name, rates.directional)
         nbytes = cache_nbytes(one, cache.elements_per_unit)
         costs.append(StageCost(stage=f"bake {one.name}", paths=paths, seconds=paths / rate, nbytes=nbytes,
                                note=_rate_note(paths, rate)))  # fmt: skip
@@ -136,11 +156,14 @@ class _Set:
     samples: list[np.ndarray]
 
 
-def _sets(settings: Settings, elements: ElementSet, pilot: Pilot) -> list[_Set]:
+def _sets(settings: Settings, elements: ElementSet, pilot: Pilot, *, gathering: bool) -> list[_Set]:
     cache, sets = settings.cache, list[_Set]()
-    if cache.lobes == "split" and elements.num_elements:
+    if cache.lobes == "split" and len(elements.diffuse):
         plain = pilot.samples.get("diffuse", [])
-        sets.append(_Set("diffuse", elements.num_elements, 1, cache.diffuse_spp, 2 * 3 * VALUE_NBYTES, 2, plain))
+        shares = {TRACED: TRACED_SHARE, DIFFUSE: GATHERED_SHARE} if gathering else {DIFFUSE: 1}
+        for name, divisor in shares.items():
+            spp = -(-cache.diffuse_spp // divisor)
+            sets.append(_Set(name, len(elements.diffuse), 1, spp, 2 * 3 * VALUE_NBYTES, 2, plain))
     packs = cache.texels == "rgb9e5" and cache.lobes == "split"
     floats = pilot.samples.get("directional", [])
     # Signed or not makes no difference to the size.

@@ -15,7 +15,7 @@ from workers.backend import dr, mi
 from workers.camera import Camera
 from workers.elements import NO_SLOT, NOT_BAKED, ElementSet
 from workers.lattice import locate_patch, locate_points
-from workers.lobes import LobeClass, diffuse_reflectance, specular_tint
+from workers.lobes import LobeClass, diffuse_reflectance, shown_albedo, specular_tint
 from workers.primary import delta_lobes, dominant_lobe
 from workers.query import CacheArrays
 from workers.settings import QuerySettings
@@ -51,7 +51,8 @@ class HitRecords:
         facing: +1 where the geometric normal looks at the viewer, -1 where not; float64 [n].
         distance: along the ray in scene units, float64 [n].
         prim_size: square root of |dp/du x dp/dv|, float64 [n].
-        albedo, tint, emission: rho_d, t_s and emitted radiance (the environment's on a miss); float64 [n, 3].
+        rho, tint, emission: rho_d, t_s and emitted radiance (the environment's on a miss); float64 [n, 3].
+        albedo: for the G-buffer; float64 [n, 3].
     """
 
     si: "mi.SurfaceInteraction3f"
@@ -67,8 +68,9 @@ class HitRecords:
     facing: np.ndarray
     distance: np.ndarray
     prim_size: np.ndarray
-    albedo: np.ndarray
+    rho: np.ndarray
     tint: np.ndarray
+    albedo: np.ndarray
     emission: np.ndarray
 
 
@@ -116,8 +118,9 @@ def trace(mi_scene: "mi.Scene", table: SurfaceTable, origin: np.ndarray, directi
         facing=np.where(toward < 0, -1.0, 1.0),
         distance=np.where(hit, _array(si.t), 0.0),
         prim_size=np.sqrt(np.linalg.norm(np.cross(_rows(si.dp_du), _rows(si.dp_dv)), axis=1)),
-        albedo=np.where(hit[:, None], _rows(rho), 0.0),
+        rho=np.where(hit[:, None], _rows(rho), 0.0),
         tint=np.where(hit[:, None], _rows(tint), 1.0),
+        albedo=np.where(hit[:, None], _rows(shown_albedo(rho, tint, device_bits, table.lobe_union)), 0.0),
         emission=_rows(si.emitter(mi_scene).eval(si)),
     )
 
@@ -195,7 +198,7 @@ class _Query:
             slots = table[points[wanted]]
             if lobe == LobeClass.DIFFUSE:
                 value, share = self.blend(slots, weight[wanted], self.diffuse)
-                value = value * (part.albedo if self.caches.demodulated else 1.0)
+                value = value * (part.rho if self.caches.demodulated else 1.0)
             else:
                 value, share = self.blend(slots, weight[wanted], partial(self.directional, part))
                 value = value * (1.0 if self.caches.exitant else part.tint)

@@ -10,7 +10,7 @@ import numpy as np
 
 from workers.backend import dr, mi
 from workers.elements import NO_SLOT, NOT_BAKED, ElementSet
-from workers.lobes import LobeClass, diffuse_reflectance, has, specular_tint
+from workers.lobes import LobeClass, diffuse_reflectance, has, shown_albedo, specular_tint
 from workers.query_directional import DirectionalLookup, four_channels, with_locators, xyz
 from workers.surfaces import SurfaceTable
 from workers.texels import DirectionalTexels
@@ -97,17 +97,17 @@ class CacheShading:
             points, weights = self.locate(shape, pi, si, cached)
             rho, tint = self._material(si, bits, cached)
             lobes = self._exitant if self.exitant else self._lobes
-            return (*lobes(points, weights, si, bits, cached, rho, tint), rho)
+            return (*lobes(points, weights, si, bits, cached, rho, tint), shown_albedo(rho, tint, bits, self.union))
 
         width = dr.width(si)
         black, none = dr.zeros(mi.Color3f, width), dr.zeros(mi.Float, width)
-        radiance, covered, asked, rho = dr.if_stmt(
+        radiance, covered, asked, albedo = dr.if_stmt(
             (black, none, mi.Float(none), mi.Color3f(black)), cached, answer, lambda *nothing: nothing
         )
         if self.exitant:
-            return Shaded(radiance + dr.select(hit, 0.0, emission), rho, covered, asked, bits)
+            return Shaded(radiance + dr.select(hit, 0.0, emission), albedo, covered, asked, bits)
         radiance = dr.maximum(radiance + emission, 0.0)
-        return Shaded(radiance, dr.clip(rho, 0.0, 1.0), covered, asked, bits)
+        return Shaded(radiance, dr.clip(albedo, 0.0, 1.0), covered, asked, bits)
 
     def _exitant(self, points, weights, si, bits, active, rho, tint):
         """(radiance, lookups answered, asked) where one lookup holds everything."""
@@ -119,7 +119,7 @@ class CacheShading:
         radiance, covered, asked = mi.Color3f(0), mi.Float(0), mi.Float(0)
         if self.has_diffuse:
             wanted = active & has(bits, LobeClass.DIFFUSE)
-            value, share = self._diffuse(points, weights, wanted)
+            value, share = self.diffuse_radiance(points, weights, wanted)
             radiance += dr.select(wanted, value * (rho if self.demodulated else 1.0), 0.0)
             covered += share
             asked += dr.select(wanted, 1.0, 0.0)
@@ -136,6 +136,12 @@ class CacheShading:
         bsdf = si.bsdf()
         rho = diffuse_reflectance(bsdf, si, bits, self.union & ~LobeClass.PRINCIPLED, hit)
         tint = dr.full(mi.Color3f, 1.0, dr.width(si))
+        if self.union & LobeClass.TINTED:
+            tinted = hit & has(bits, LobeClass.TINTED)
+            sampled = self.union & ~LobeClass.PRINCIPLED
+            tint = dr.if_stmt(
+                (tint,), tinted, lambda _: (specular_tint(bsdf, si, bits, sampled, tinted),), lambda one: (one,)
+            )[0]
         if not self.union & LobeClass.PRINCIPLED:
             return rho, tint
         principled = hit & has(bits, LobeClass.PRINCIPLED)
@@ -165,7 +171,8 @@ class CacheShading:
         indices, weights = _lattice_points(b1, b2, mi.Int32(patch.x))
         return [(patch.y + mi.UInt32(index)) * 2 + side for index in indices], weights
 
-    def _diffuse(self, points, weights, active):
+    def diffuse_radiance(self, points, weights, active):
+        """(interpolated diffuse cache, share that baked elements answered)."""
         value, covered, total = mi.Color3f(0), mi.Float(0), mi.Float(0)
         for point, weight in zip(points, weights, strict=True):
             slot, baked = self.slot(self.diffuse_slot, point, active)

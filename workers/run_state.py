@@ -28,6 +28,7 @@ class RunState:
         settings: checked settings.
         progress: where progress goes.
         seconds: wall seconds of each stage of this run, as they end.
+        made: what a stage of this process made and may need again, by key.
     """
 
     scene: Scene
@@ -35,6 +36,7 @@ class RunState:
     settings: Settings
     progress: Progress = field(default_factory=Progress)
     seconds: dict[str, float] = field(default_factory=dict)
+    made: dict[str, Any] = field(default_factory=dict)
 
     @cached_property
     def table(self) -> SurfaceTable:

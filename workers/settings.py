@@ -29,11 +29,14 @@ class CacheSettings:
         max_elements: budget of seen lattice elements; the lattice's spacing is solved from it.
         min_spacing_px: no finer than this many pixels of the domain's cameras.
         domain_poses: poses of the camera domain that decide what is seen.
-        diffuse_spp: paths per element for the diffuse lobe.
+        diffuse_spp: paths per element for the diffuse lobe; where caches are gathered from, a quarter of them to their
+            end and half of them into those caches.
         grids: "adaptive" (each element gets the coarsest grid of 8x2, 16x4, 32x8, 64x16 and 128x32 that its
             lobe's width asks for) or "uniform" (azimuth x polar everywhere; always so where lobes is "exitant").
         azimuth, polar: directions per element of the directional lobe; with adaptive grids the finest one that
             is allowed (below 8x2 they are used as they are).
+        gather: where paths meet a baked diffuse surface: "caches" (they take its radiance and end, `workers/gather.py`;
+            paths limited to fewer than 8 segments never do) or "paths" (they go on).
         directional_spp: paths per direction of the finest grid allowed; each coarser one doubles them, which
             halves the paths of an element.
         texels: the directional lobe at rest and in the query: "rgb9e5" (shared exponent, 4 bytes a texel, error at
@@ -57,6 +60,7 @@ class CacheSettings:
     azimuth: int = 32
     polar: int = 8
     directional_spp: int = 8
+    gather: Literal["caches", "paths"] = "caches"
     texels: Literal["float32", "rgb9e5"] = "rgb9e5"
     passes: int = 1
     elements_per_unit: int = 256

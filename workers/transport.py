@@ -9,15 +9,19 @@ Mitsuba's `si.wi` points to the viewer, its `wo` to the light.
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from workers.backend import dr, mi
-from workers.lobes import context
+from workers.lobes import SMOOTH_MASK, context
+
+if TYPE_CHECKING:
+    from workers.gather import DiffuseGather
 
 RR_DEPTH = 5
 # Mitsuba's own 0.95 has infinite variance in a closed box of albedo 0.99: a bounce multiplies the mean of the squared
 # weight by albedo^2 / survival, which must stay below 1.
 RR_MAX_SURVIVAL = 0.99
-TRANSPORT_VERSION = 2  # part of the keys of what is baked; raise it whenever the estimator gives other values
+TRANSPORT_VERSION = 3  # part of the keys of what is baked; raise it whenever the estimator gives other values
 UNLIMITED_DEPTH = 0xFFFFFFFF
 
 
@@ -51,7 +55,9 @@ def power_heuristic(pdf_a: "mi.Float", pdf_b: "mi.Float") -> "mi.Float":
 
 
 @dr.syntax
-def incident_radiance(scene: "mi.Scene", start: PathStart, rng: "mi.PCG32", max_depth: int) -> "mi.Color3f":
+def incident_radiance(
+    scene: "mi.Scene", start: PathStart, rng: "mi.PCG32", max_depth: int, gather: "DiffuseGather | None" = None
+) -> "mi.Color3f":
     """Estimates `beta * L_i` along `start.ray`; one sample a lane.
 
     Args:
@@ -60,6 +66,7 @@ def incident_radiance(scene: "mi.Scene", start: PathStart, rng: "mi.PCG32", max_
         rng: random numbers, one stream a lane; advanced.
         max_depth: longest path, counted as Mitsuba's `path` counts from a camera that looks at the first vertex:
             the emission found by `start.ray` needs max_depth >= 2. Negative: unlimited.
+        gather: knows the radiance of some diffuse surfaces; a path that meets one takes it and ends.
 
     Returns:
         Color3f, linear radiance times `start.beta`.
@@ -79,7 +86,8 @@ def incident_radiance(scene: "mi.Scene", start: PathStart, rng: "mi.PCG32", max_
     active = mi.Bool(start.active) & (limit > 0)
 
     while active:
-        si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
+        pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
 
         # ---------------------- Emission met by the sampled direction ----------------------
         emitter = si.emitter(scene)
@@ -90,6 +98,13 @@ def incident_radiance(scene: "mi.Scene", start: PathStart, rng: "mi.PCG32", max_
 
         goes_on = active & (depth + 1 < limit) & si.is_valid()
         bsdf = si.bsdf(ray)
+
+        # ------------------------- Radiance that caches know already -----------------------
+        if dr.hint(gather is not None, mode="scalar"):
+            assert gather is not None
+            cached, known = gather.radiance(pi, si, goes_on)
+            L += beta * cached
+            goes_on &= ~known
 
         # ------------------------------ Next-event estimation ------------------------------
         nee = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
@@ -179,7 +194,7 @@ def exitant_start(
     sample_2 = mi.Point2f(rng.next_float32(), rng.next_float32())
     value, pdf, bs, weight = bsdf.eval_pdf_sample(lobes.ctx, si, wo, sample_1, sample_2, mi.Bool(True))
     if lobes.whole is not None:
-        smooth = context(int(mi.BSDFFlags.Smooth | mi.BSDFFlags.Null))
+        smooth = context(SMOOTH_MASK)
         every = bsdf.eval_pdf_sample(smooth, si, wo, sample_1, sample_2, lobes.whole)
         partial = (value, pdf, bs, weight)
         value, pdf, bs, weight = (dr.select(lobes.whole, a, b) for a, b in zip(every, partial, strict=True))

@@ -122,7 +122,8 @@ def _census(run: RunState) -> dict[str, Any]:
 
 def _inventory(run: RunState, loaded: LoadedRun) -> dict[str, Any]:
     sets = bake_sets(run, loaded.elements)
-    lobes = {name: {"key": found.ref.key, "num_units": found.num_units, "lanes_per_unit": found.lanes_per_unit}
+    lobes = {name: {"key": found.ref.key, "num_units": found.num_units, "lanes_per_unit": found.lanes_per_unit,
+                    "after": found.after}
              for name, found in sets.items()}  # fmt: skip
     inputs = {path: [inputs_ref(run, loaded.elements, camera).key for _, camera in frames]
               for path, frames in frames_of(run).items() if path != "test"}  # fmt: skip

@@ -116,11 +116,13 @@ class Census:
 
 @dataclass(frozen=True)
 class LobeInventory:
-    """One cache set: its key, how many bake units it has and how many camera paths each of them costs."""
+    """One cache set: its key, how many bake units it has, how many camera paths each of them costs, and the set in
+    which its paths end, which must be whole before ("" for none)."""
 
     key: str
     num_units: int
     lanes_per_unit: int
+    after: str = ""
 
     @property
     def group(self) -> int:
@@ -168,7 +170,8 @@ def blocks_after_inventory(census: Census, inventory: Inventory, last_stage: str
     blocks = []
     for lobe, found in inventory.lobes.items():
         key = (found.key,)
-        blocks.append(Block("bake", lobe, found.num_units, found.group, key, needs=("inventory",)))
+        needs = ("inventory", f"seal {found.after}") if found.after else ("inventory",)
+        blocks.append(Block("bake", lobe, found.num_units, found.group, key, needs=needs))
         blocks.append(Block("seal", lobe, keys=key, needs=(f"bake {lobe}",)))
     if not _reaches(last_stage, "train"):
         return blocks

@@ -40,6 +40,7 @@ MATERIALS: dict[str, dict[str, Any]] = {
     "roughplastic": ROUGH_PLASTIC,
     "roughplastic_twosided_back": {"type": "twosided", "bsdf": ROUGH_PLASTIC},
     "roughconductor": ROUGH_METAL,
+    "tiled_conductor": ROUGH_METAL | {"specular_reflectance": {"type": "checkerboard"}},
     "conductor": {"type": "conductor", "material": "Cr"},
     "principled_0": principled(0.0),
     "principled_half": principled(0.5),

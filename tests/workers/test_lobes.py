@@ -15,6 +15,7 @@ DIFFUSE = {"type": "diffuse", "reflectance": COLOUR}
 ROUGH_PLASTIC = {"type": "roughplastic", "diffuse_reflectance": COLOUR, "alpha": 0.2}
 ROUGH_METAL = {"type": "roughconductor", "material": "Cr", "alpha": 0.3}
 PRINCIPLED = {"type": "principled", "base_color": COLOUR, "metallic": 0.5, "roughness": 0.4}
+TILES = {"type": "checkerboard", "color0": 0.8, "color1": 0.2}
 MATERIALS: dict[str, dict[str, Any]] = {
     "diffuse": DIFFUSE,
     "twosided": {"type": "twosided", "bsdf": DIFFUSE},
@@ -31,6 +32,14 @@ MATERIALS: dict[str, dict[str, Any]] = {
     "mask_principled": {"type": "mask", "opacity": 0.3, "bsdf": PRINCIPLED},
     "blend": {"type": "blendbsdf", "weight": 0.3, "a": DIFFUSE, "b": ROUGH_METAL},
     "blend_principled": {"type": "blendbsdf", "weight": 0.3, "a": DIFFUSE, "b": PRINCIPLED},
+    "tiled_metal": {"type": "twosided", "bsdf": ROUGH_METAL | {"specular_reflectance": TILES}},
+    "scratched_metal": ROUGH_METAL | {"alpha": TILES},
+    "tiled_blend": {
+        "type": "blendbsdf",
+        "weight": 0.3,
+        "a": {"type": "diffuse", "reflectance": TILES},
+        "b": PRINCIPLED,
+    },
 }
 D, G, DELTA, M, P = (
     LobeClass.DIFFUSE, LobeClass.GLOSSY, LobeClass.DELTA, LobeClass.MASKABLE, LobeClass.PRINCIPLED
@@ -51,6 +60,9 @@ CLASSES = {
     "mask_principled": G | DELTA | LobeClass.WHOLE,
     "blend": D | M | G,
     "blend_principled": G | LobeClass.WHOLE,
+    "tiled_metal": G | LobeClass.TINTED,
+    "scratched_metal": G,
+    "tiled_blend": G | LobeClass.WHOLE | LobeClass.TINTED,
 }
 COSINES = np.array([1.0, 0.9, 0.6, 0.3, 0.1], np.float32)
 
@@ -138,6 +150,25 @@ def test_specular_tint_is_schlick(metallic: float, expected: tuple[float, ...]) 
     f0 = np.array(expected)
     schlick = f0 + (1 - f0) * (1 - COSINES[:, None]) ** 5
     np.testing.assert_allclose(np.array(tint).T, schlick, rtol=1e-4)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_specular_tint_of_tiles_is_their_reflectance(bsdfs: Materials, side: int) -> None:
+    """From any direction: that of the metal along its normal, times the texture."""
+    tints = {}
+    for name in ("tiled_metal", "tiled_blend"):
+        bits = classify_bsdf(bsdfs[name])
+        si = seen_from(side * COSINES)
+        tints[name] = []
+        for v in (0.25, 0.75):
+            si.uv = mi.Point2f(0.25, v)
+            tint = specular_tint(mi.BSDFPtr(bsdfs[name]), si, mi.UInt32(int(bits)), bits, mi.Bool(True))
+            tints[name].append(np.array(tint).T)
+    light, dark = tints["tiled_metal"]
+    np.testing.assert_allclose(light, 4 * dark, rtol=1e-5)
+    assert np.ptp(light, axis=0).max() < 1e-6 and 0.3 < light.min() < light.max() < 0.8
+    if side == 1:  # behind, the blend is black
+        assert np.all(tints["tiled_blend"][0] > 1.3 * tints["tiled_blend"][1])
 
 
 def test_specular_tint_is_one_where_nothing_is_divided(bsdfs: Materials) -> None:

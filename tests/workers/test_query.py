@@ -58,6 +58,7 @@ def vitrine() -> Seen:
     grey = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": rgb(0.6, 0.5, 0.4)}}
     plastic = {"type": "plastic", "diffuse_reflectance": rgb(0.3, 0.5, 0.2)}
     metal = {"type": "principled", "base_color": rgb(0.7, 0.4, 0.2), "metallic": 0.6, "roughness": 0.3}
+    tiled = {"type": "roughconductor", "alpha": 0.2, "specular_reflectance": {"type": "checkerboard"}}
     glow = {"type": "area", "radiance": rgb(2.0, 1.5, 1.0)}
     scene = {
         "type": "scene",
@@ -70,6 +71,8 @@ def vitrine() -> Seen:
                   @ to().scale([0.25, 0.4, 0.08]), "bsdf": {"type": "dielectric"}},
         "mirror": {"type": "rectangle", "to_world": to().translate([0, 1, -1.2]) @ to().scale(0.9),
                    "bsdf": {"type": "conductor", "material": "Cr"}},
+        "tiles": {"type": "rectangle", "to_world": to().translate([-0.2, 0.01, 1.2]) @ to().rotate([1, 0, 0], -90)
+                  @ to().scale(0.5), "bsdf": tiled},
         "screen": {"type": "rectangle", "to_world": to().translate([1.5, 0.8, 0.4]) @ to().scale(0.5),
                    "bsdf": {"type": "mask", "opacity": 0.4, "bsdf": grey}},
         "lamp": {"type": "sphere", "center": [0.4, 2.2, 0.0], "radius": 0.2, "emitter": glow, "bsdf": grey},

@@ -17,7 +17,7 @@ from workers.units import (
 )
 
 CENSUS = Census("d1", "e1", {"train": ("r0", "r1"), "validation": ("v0",), "test": ("t0", "t1")})
-LOBES = {"diffuse": LobeInventory("b0", 100, 1 << 20), "directional": LobeInventory("b1", 3, 1 << 30)}
+LOBES = {"diffuse": LobeInventory("b0", 100, 1 << 20), "directional": LobeInventory("b1", 3, 1 << 30, after="diffuse")}
 INVENTORY = Inventory(LOBES, {"train": ("i0", "i1"), "validation": ("j0",)})
 FRAMES = {"render train", "render validation", "render test"}
 INPUTS = {"inputs train", "inputs validation"}
@@ -34,6 +34,7 @@ def test_plan_of_a_whole_run_names_every_dependency() -> None:
     assert needs["elements"] == needs["render test"] == {"census"}
     assert needs["bake diffuse"] == {"inventory"}
     assert needs["seal diffuse"] == {"bake diffuse"}
+    assert needs["bake directional"] == {"inventory", "seal diffuse"}
     assert needs["inputs train"] == {"inventory", "seal diffuse", "seal directional"}
     assert needs["train"] == {"inputs train", "inputs validation", "render train", "render validation"}
     assert needs["evaluate"] == {"train", "render test"}
