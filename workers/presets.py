@@ -7,7 +7,8 @@ PRESET_OVERRIDES: dict[str, dict[str, Any]] = {
     "balanced": {
         "cache.max_elements": 150_000, "cache.diffuse_spp": 4096, "cache.directional_spp": 16,
         "frames.num_train": 72, "frames.num_validation": 8, "frames.num_test": 12, "frames.train_spp": 256,
-        "frames.test_spp": 4096, "train.seconds": 3600.0, "train.epochs": 1000, "plan.noise": 0.03,
+        "frames.test_spp": 4096, "train.seconds": 3600.0, "train.epochs": 1000, "train.widths": (32, 48, 64),
+        "plan.noise": 0.03,
     },
     "reference": {
         "cache.max_elements": 400_000, "cache.diffuse_spp": 16_384, "cache.azimuth": 64, "cache.polar": 16,

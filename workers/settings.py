@@ -131,7 +131,7 @@ class TrainSettings:
         precision: of training and inference: "fp32", "bf16" or "auto" (measured).
     """
 
-    widths: tuple[int, ...] = (32, 48, 64)
+    widths: tuple[int, ...] = (16, 32, 48)
     fusion: Literal["fuse", "concatenate"] = "fuse"
     unshuffle: int = 2
     residual: bool = True

@@ -1,5 +1,6 @@
 """Plans of small scenes: what they choose, what they leave, and whether they say what a run does."""
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -25,6 +26,7 @@ from workers.settings import Settings, SettingsError
 
 ROUGH = {"type": "roughconductor", "alpha": 0.5}
 RATES = Rates(elements_s=1.0, diffuse=1e6, directional=1e6, frames=1e6, step_s={(16, 16, 16): 0.1})
+GATHERING = dataclasses.replace(RATES, gathered=1e6)
 
 
 @pytest.fixture(scope="module")
@@ -142,11 +144,12 @@ def test_predicted_paths_and_bytes_are_those_of_the_bake(tmp_path: Path) -> None
     scene = load_scene("tiny", width=64, height=64)
     run = RunState(scene, store, Settings.preset_named("tiny"))
     decision = decide(run)
-    costs = {cost.stage: cost for cost in stage_costs(run.settings, decision.element_set, RATES, decision.pilot)}
+    costs = {cost.stage: cost for cost in stage_costs(run.settings, decision.element_set, GATHERING, decision.pilot)}
     elements = run_elements(run)
     run_bake(run, elements)
     cache = run.settings.cache
-    assert costs["bake diffuse"].paths == len(elements.diffuse) * cache.diffuse_spp
+    assert costs["bake diffuse-traced"].paths == len(elements.diffuse) * cache.diffuse_spp // 4
+    assert costs["bake diffuse"].paths == len(elements.diffuse) * cache.diffuse_spp // 2
     directional = [cost for stage, cost in costs.items() if stage.startswith("bake directional")]
     assert sum(cost.paths for cost in directional) == directional_cost(elements, cache)["paths"]
     for lobe, ref in bake_refs(run, elements).items():
