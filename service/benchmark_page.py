@@ -182,7 +182,9 @@ def _bake(bake: Mapping[str, Any]) -> list[str]:
     return [
         "### Throughput of the bake", "",
         f"Whole launches of the bake's kernels against Mitsuba's `path` integrator from the scene's own "
-        f"view, longest path {depth}; medians of {bake['repeats']} interleaved rounds, warm.", "",
+        f"view, longest path {depth}; medians of {bake['repeats']} interleaved rounds, warm."
+        + (" Paths of `diffuse-traced` go to their end as Mitsuba's do; those of the other sets end where they meet a "
+           "diffuse cache." if "diffuse-traced" in rates else ""), "",
         *table(("paths from", "M paths/s", "ratio", "paths a launch"), rows),
     ]  # fmt: skip
 

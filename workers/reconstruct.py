@@ -16,6 +16,7 @@ from models.network import FusionNet, NetworkConfig
 from models.transfer import Transfer
 from workers.backend import pool_at_rest
 from workers.query import CHANNELS
+from workers.timing import bf16_is_fast
 
 # bf16 is used only where its frame is this close to fp32's: far below what any reference can resolve.
 BF16_GATE_DB = 50.0
@@ -94,7 +95,8 @@ class Reconstructor:
     Args:
         network: the network, fp32.
         encoding: its transfer functions.
-        precision: "fp32", "bf16" or "auto" (bf16 where it passes `BF16_GATE_DB` and is faster).
+        precision: "fp32", "bf16" or "auto" (bf16 where the device computes in it, and it passes `BF16_GATE_DB` and is
+            faster).
         compile: try `torch.compile` and keep it where it is faster; costs tens of seconds a size. Sizes beyond the
             first `MAX_COMPILED` run without.
     """
@@ -131,7 +133,8 @@ class Reconstructor:
     def _choose(self, features: Tensor) -> tuple[str, Any]:
         """Measures the candidates on real input of a size; returns the best one's name and itself."""
         candidates: dict[str, Any] = {"fp32": self._fp32}
-        if self._precision != "fp32" and self._passes_gate(self._bf16, features):
+        tries_bf16 = self._precision == "bf16" or (self._precision == "auto" and bf16_is_fast(self.device))
+        if tries_bf16 and self._passes_gate(self._bf16, features):
             candidates["bf16"] = self._bf16
         if self._precision == "bf16" and "bf16" in candidates:
             del candidates["fp32"]

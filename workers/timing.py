@@ -7,6 +7,7 @@ machine hits all alike, and medians count. A first round, not counted, compiles 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 
 import numpy as np
 import psutil
@@ -15,7 +16,10 @@ import torch
 from workers.progress import Progress
 
 MATMUL_EDGE = 2048
+MATMUL_SMALLEST = 256
+MATMUL_SECONDS = 0.02
 MATMUL_REPEATS = 4
+BF16_WORST = 2.0  # of fp32's time: with instructions of its own bfloat16 takes less than once
 
 
 def interleaved_medians(
@@ -103,7 +107,20 @@ def _busy_seconds(times: object) -> float:
 
 
 def matmul_gflop_per_s(dtype: torch.dtype, device: torch.device, edge: int = MATMUL_EDGE) -> float:
-    """Best rate of a few products of two edge x edge matrices, GFLOP/s (a multiply-add is 2)."""
+    """Best rate of a few products of two square matrices, GFLOP/s (a multiply-add is 2).
+
+    Their edge doubles up to `edge` while a product takes less than `MATMUL_SECONDS`: a CPU without bfloat16
+    instructions would take minutes for a large one.
+    """
+    size = min(MATMUL_SMALLEST, edge)
+    while True:
+        seconds = _matmul_seconds(dtype, device, size)
+        if size >= edge or seconds > MATMUL_SECONDS:
+            return 2.0 * size**3 / seconds / 1e9
+        size = min(2 * size, edge)
+
+
+def _matmul_seconds(dtype: torch.dtype, device: torch.device, edge: int) -> float:
     a, b = (torch.rand(edge, edge, device=device).to(dtype) for _ in range(2))
     times = []
     for _ in range(MATMUL_REPEATS + 1):
@@ -112,4 +129,12 @@ def matmul_gflop_per_s(dtype: torch.dtype, device: torch.device, edge: int = MAT
         if product.is_cuda:
             torch.cuda.synchronize()
         times.append(time.perf_counter() - start)
-    return 2.0 * edge**3 / min(times[1:]) / 1e9
+    return min(times[1:])
+
+
+@lru_cache(maxsize=4)
+def bf16_is_fast(device: torch.device) -> bool:
+    """Whether bfloat16 is worth trying on a device: without instructions for it, a CPU takes hundreds of times as long
+    as in fp32, and trying it on a frame or a training step takes minutes."""
+    fp32, bf16 = (_matmul_seconds(dtype, device, MATMUL_SMALLEST) for dtype in (torch.float32, torch.bfloat16))
+    return bf16 < BF16_WORST * fp32

@@ -20,6 +20,7 @@ from workers.errors import StoppedError, WorkerError
 from workers.reconstruct import GBUFFER_CHANNELS, FrameModule, channels_last
 from workers.run_state import RunState
 from workers.schedule import learning_rate
+from workers.timing import bf16_is_fast
 from workers.training_data import CropSampler, Dataset, fitted_encoding
 
 CHECKPOINT_SECONDS = float(os.environ.get("LIGHTWELL_CHECKPOINT_SECONDS", "60"))
@@ -125,7 +126,7 @@ class Trainer:
         if settings.seconds <= 0 and settings.precision == "fp32":
             return full
         seconds = {False: self._probe(full, False)}
-        if settings.precision != "fp32":
+        if settings.precision == "bf16" or (settings.precision == "auto" and bf16_is_fast(self.device)):
             seconds[True] = self._probe(full, True)
         self.autocast = settings.precision == "bf16" or min(seconds, key=lambda key: seconds[key])
         if settings.seconds <= 0:

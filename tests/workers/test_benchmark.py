@@ -99,6 +99,26 @@ def test_matmul_rate_counts_a_multiply_add_as_two(monkeypatch: pytest.MonkeyPatc
     assert rate == pytest.approx(2 * 8**3 / 1e9)
 
 
+def test_matmul_grows_until_it_takes_long_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    edges: list[int] = []
+
+    def seconds(dtype: Any, device: Any, edge: int) -> float:
+        edges.append(edge)
+        return edge**3 * 1e-9
+
+    monkeypatch.setattr(timing, "_matmul_seconds", seconds)
+    assert timing.matmul_gflop_per_s(torch.bfloat16, torch.device("cpu"), edge=4096) == pytest.approx(2.0)
+    assert edges == [256, 512]
+
+
+@pytest.mark.parametrize(("slowdown", "fast"), [(0.5, True), (1.5, True), (300.0, False)])
+def test_bf16_is_fast_where_the_machine_computes_in_it(
+    monkeypatch: pytest.MonkeyPatch, slowdown: float, fast: bool
+) -> None:
+    monkeypatch.setattr(timing, "_matmul_seconds", lambda dtype, *_: slowdown if dtype == torch.bfloat16 else 1.0)
+    assert timing.bf16_is_fast.__wrapped__(torch.device("cpu")) is fast
+
+
 def test_other_load_is_what_is_busy_beside_this_process_and_its_children(
     clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -209,11 +229,14 @@ def test_bake_throughput_counts_the_paths_of_both_lobes_and_of_mitsuba(run: RunS
     elements, cache = run_elements(run), run.settings.cache
     paths = dict(result["paths"])
     traced = paths.pop(benchmark.PATH_TRACER)
-    assert paths.pop("diffuse") == elements.num_elements * cache.diffuse_spp
+    num_diffuse = len(elements.diffuse)
+    assert paths.pop("diffuse-traced") == num_diffuse * cache.diffuse_spp // 4
+    assert paths.pop("diffuse") == num_diffuse * cache.diffuse_spp // 2
     assert sum(paths.values()) == directional_cost(elements, cache)["paths"] > 0
     assert traced == pytest.approx(max(result["paths"].values()), abs=32 * 32 / 2)
     rates = result["paths_per_s"]
-    assert result["ratios"] == {name: rates[name] / rates[benchmark.PATH_TRACER] for name in ("diffuse", *paths)}
+    assert result["ratios"] == {name: rates[name] / rates[benchmark.PATH_TRACER] for name in result["paths"]
+                                if name != benchmark.PATH_TRACER}  # fmt: skip
     assert json.loads(json.dumps(result)) == result
 
 

@@ -88,6 +88,19 @@ def test_sizes_are_remembered_up_to_a_bound_and_the_oldest_is_measured_again(mon
     assert measured == [*sizes, (8, 40), sizes[1]]
 
 
+def test_bf16_is_not_tried_where_the_device_does_not_compute_in_it(
+    features: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(self: Reconstructor, *_: object) -> bool:
+        raise AssertionError("minutes on such a machine")
+
+    monkeypatch.setattr(Reconstructor, "_passes_gate", refuse)
+    monkeypatch.setattr("workers.reconstruct.bf16_is_fast", lambda device: False)
+    reconstructor = Reconstructor(FusionNet(CONFIG), ENCODING, precision="auto")
+    reconstructor(features)
+    assert set(reconstructor.choices.values()) == {"fp32"}
+
+
 def test_sizes_share_one_copy_in_bf16() -> None:
     reconstructor = Reconstructor(FusionNet(CONFIG), ENCODING, precision="bf16")
     for height in (8, 12, 16):
