@@ -158,7 +158,8 @@ def measure(
     elements, elements_s = _timed_elements(run)
     figures: dict[str, Any] = {
         "target": request.target, "triangles": triangles, "rule": rule, "elements": elements.num_elements,
-        "directional_elements": len(elements.glossy), "spacing_px": elements.spacing_px,
+        "diffuse_elements": len(elements.diffuse), "directional_elements": len(elements.glossy),
+        "spacing_px": elements.spacing_px,
         "elements_seconds": elements_s, "elements_nbytes": store.nbytes(elements_ref(run)),
     }  # fmt: skip
     lobes = {}

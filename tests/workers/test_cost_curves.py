@@ -119,7 +119,7 @@ def test_sample_measures_what_it_says(tmp_path: Path) -> None:
     assert program is not None and program.run(camera).shape[:2] == (20, 24)
     assert figures["rule"] == "tessellated" and 700 < figures["triangles"] < 1300
     assert 0 < figures["elements"] <= 300
-    assert figures["bake_paths"] == 4 * figures["elements"] + 8 * figures["directional_elements"]
+    assert figures["bake_paths"] == (1 + 2) * figures["diffuse_elements"] + 8 * figures["directional_elements"]
     assert 0 < figures["sampled_paths"] <= figures["bake_paths"]
     for name in ("elements_seconds", "bake_seconds", "nbytes", "memory_nbytes", "peak_resident_nbytes"):
         assert figures[name] > 0
