@@ -85,7 +85,7 @@ def lobes_of(run: RunState, elements: ElementSet) -> list[Lobe]:
     common = {"elements": elements_ref(run).key, "max_depth": run.scene.max_depth, "passes": cache.passes,
               "elements_per_unit": cache.elements_per_unit, "transport": TRANSPORT_VERSION}  # fmt: skip
     found, gathered = list[Lobe](), None
-    if gathers(cache, run.scene.max_depth, elements):
+    if gathers(cache, run.scene.max_depth, run.table, elements):
         found.append(_diffuse(run, elements, common, TRACED, -(-cache.diffuse_spp // TRACED_SHARE), None))
         traced = run.ref(STAGE, found[0].params)
         params = common | gather_params(traced, cache)

@@ -30,13 +30,17 @@ GATHER_VERSION = 1  # part of the keys of what is baked with it
 # D holds paths of full length wherever it is met. With fewer bounces than this the light beyond the limit would show.
 MIN_DEPTH = 8
 MIN_BAKED = 0.999  # share of the lookup that baked elements answer, at least: stand-ins are for pictures
+MIN_SHARE = 0.1  # of the elements that are purely diffuse, at least: else a first round of D is not worth its paths
 _LONGER = int(LobeClass.GLOSSY | LobeClass.DELTA | LobeClass.PRINCIPLED)
 
 
-def gathers(cache: CacheSettings, max_depth: int, elements: ElementSet) -> bool:
-    """Whether paths of a bake end in diffuse caches."""
+def gathers(cache: CacheSettings, max_depth: int, table: SurfaceTable, elements: ElementSet) -> bool:
+    """Whether paths of a bake end in diffuse caches: never where hardly any of them could."""
     deep = max_depth < 0 or max_depth >= MIN_DEPTH
-    return cache.gather == "caches" and cache.lobes == "split" and deep and len(elements.diffuse) > 0
+    if cache.gather != "caches" or cache.lobes != "split" or not deep or elements.num_elements == 0:
+        return False
+    ends = np.array([bool(lobe & LobeClass.DIFFUSE) and not lobe & _LONGER for lobe in table.lobes])
+    return bool(ends[elements.shape].mean() >= MIN_SHARE)
 
 
 def gather_params(diffuse: UnitRef, cache: CacheSettings) -> dict[str, Any]:

@@ -212,7 +212,7 @@ class _PilotBake:
     def _gather(self) -> DiffuseGather | None:
         """Ends of paths as the bake will have them, with the pilot's own D: every element takes the nearest one's."""
         elements = self.elements
-        if not gathers(self.cache, self.max_depth, elements):
+        if not gathers(self.cache, self.max_depth, self.table, elements):
             return None
         chosen, values = (np.concatenate(parts) for parts in zip(*self.known, strict=True))
         nearest = cKDTree(elements.position[chosen]).query(elements.position)[1]

@@ -70,7 +70,7 @@ def calibrate(run: RunState, elements: ElementSet, widths: set[tuple[int, ...]],
     """
     cache, scene, gather = run.settings.cache, run.scene, None
     diffuse = directional = gathered = 0.0
-    if gathers(cache, scene.max_depth, elements):
+    if gathers(cache, scene.max_depth, run.table, elements):
         gather = DiffuseGather.of_nothing(scene.mi_scene, run.table, elements)
     if cache.lobes == "split" and len(elements.diffuse):
         diffuse = _diffuse_rate(run, elements, None)

@@ -36,7 +36,8 @@ class CacheSettings:
         azimuth, polar: directions per element of the directional lobe; with adaptive grids the finest one that
             is allowed (below 8x2 they are used as they are).
         gather: where paths meet a baked diffuse surface: "caches" (they take its radiance and end, `workers/gather.py`;
-            paths limited to fewer than 8 segments never do) or "paths" (they go on).
+            never with paths of fewer than 8 segments or where hardly any surface is purely diffuse) or "paths" (they
+            go on).
         directional_spp: paths per direction of the finest grid allowed; each coarser one doubles them, which
             halves the paths of an element.
         texels: the directional lobe at rest and in the query: "rgb9e5" (shared exponent, 4 bytes a texel, error at

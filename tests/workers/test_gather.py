@@ -1,5 +1,6 @@
 """Paths that end in diffuse caches, against the same paths to their end."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from workers.bake_kernels import Batch, bake_diffuse, bake_directional
 from workers.camera import Camera
 from workers.elements import ElementSet, build_elements
 from workers.gather import DiffuseGather, gather_params, gathers
+from workers.lobes import LobeClass
 from workers.progress import Progress
 from workers.settings import CacheSettings
 from workers.surfaces import SurfaceTable, build_surface_table
@@ -90,12 +92,14 @@ def test_only_baked_diffuse_surfaces_are_known(room: Any, gather: DiffuseGather)
     assert np.all(np.array(value)[:, 0] == 0) and np.all(np.array(value)[:, 1] > 0)
 
 
-def test_gathering_is_off_where_paths_are_short_or_caches_hold_everything(room: Any) -> None:
-    elements = room[2]
-    assert gathers(CACHE, -1, elements) and gathers(CACHE, 8, elements)
-    assert not gathers(CACHE, 7, elements)
-    assert not gathers(CacheSettings(gather="paths"), -1, elements)
-    assert not gathers(CacheSettings(lobes="exitant"), -1, elements)
+def test_gathering_is_off_where_paths_are_short_or_could_hardly_end(room: Any) -> None:
+    _, table, elements = room
+    assert gathers(CACHE, -1, table, elements) and gathers(CACHE, 8, table, elements)
+    assert not gathers(CACHE, 7, table, elements)
+    assert not gathers(CacheSettings(gather="paths"), -1, table, elements)
+    assert not gathers(CacheSettings(lobes="exitant"), -1, table, elements)
+    metal_only = dataclasses.replace(table, lobes=[LobeClass.GLOSSY for _ in table.lobes])
+    assert not gathers(CACHE, -1, metal_only, elements)
 
 
 def test_keys_follow_what_is_gathered_from() -> None:
