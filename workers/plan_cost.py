@@ -98,13 +98,10 @@ def _diffuse_rate(run: RunState, elements: ElementSet, gather: DiffuseGather | N
     cache, scene, owners = run.settings.cache, run.scene, elements.diffuse
     spp = min(cache.diffuse_spp, max(1, CALIBRATION_PATHS // min(cache.elements_per_unit, len(owners))))
     batch = spread_batch(owners, cache.elements_per_unit, spp, CALIBRATION_PATHS)
-    return (
-        len(batch.element)
-        * spp
-        / _warm_seconds(
-            lambda index: bake_diffuse(scene.mi_scene, run.table, elements, batch, spp, index, scene.max_depth, gather)
-        )
+    seconds = _warm_seconds(
+        lambda index: bake_diffuse(scene.mi_scene, run.table, elements, batch, spp, index, scene.max_depth, gather)
     )
+    return len(batch.element) * spp / seconds
 
 
 def _warm_seconds(launch) -> float:
