@@ -16,7 +16,6 @@ from service.jobs.service import Jobs
 from service.jobs.submission import Desk
 from service.serving import bind
 from storage.store import Store, UnitRef
-from workers.scene_request import SceneRequest
 
 UNIT_S = 0.05
 
@@ -53,11 +52,19 @@ class NoScenes:
     def scenes(self) -> list[dict[str, Any]]:
         return []
 
+    def warm_up(self) -> None: ...
+
+
+def read_scene(_: str) -> Any:
+    """Imported when a job is submitted, as the service does: Mitsuba is not what a restart waits for."""
+    from workers.scene_request import SceneRequest
+
+    return SceneRequest(name="tiny", width=8, height=8)
+
 
 def main() -> None:
     folder, port, num_units = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
-    wish = SceneRequest(name="tiny", width=8, height=8)
-    desk = Desk(resolve_scene_source=lambda name: name, read_scene=lambda _: wish)
+    desk = Desk(resolve_scene_source=lambda name: name, read_scene=read_scene)
     jobs = Jobs(f"sqlite:///{folder / 'jobs.sqlite'}", UnitRunner(folder, num_units), desk)
     with bind("127.0.0.1", port) as listener:
         app = create_app("unused", make_backend=NoScenes, jobs=jobs)  # type: ignore[arg-type]
