@@ -83,8 +83,14 @@ class JobRun:
 
     def _ask(self) -> None:
         """Asks for units until enough are in flight or nothing else is ready."""
+        while self._ask_once():
+            pass
+
+    def _ask_once(self) -> bool:
+        """Goes through the blocks once; whether one ended, as what the store has whole does: others may be ready."""
+        one_ended = False
         for run in list(self._runs.values()):
-            if run.ended or run.exhausted or not self._ready(run.block):
+            if run.exhausted or not self._ready(run.block):
                 continue
             if run.pending is None:
                 run.open(self._done(run.block))
@@ -92,8 +98,10 @@ class JobRun:
                 unit = run.next_unit()
                 if unit is None:
                     self._tell_progress(run, now=True)
+                    one_ended |= run.ended
                     break
                 self._request(run, unit)
+        return one_ended
 
     def _request(self, run: BlockRun, unit: Unit) -> None:
         if unit.stage in ("train", "evaluate"):
@@ -227,6 +235,8 @@ class JobRun:
                 f"every unit must succeed within {self._set_aside[0]['attempts']} attempts, got set aside: "
                 f"{reasons}{rest}; everything else is kept, mend the cause and retry the job"
             )
+        if idle := [name for name, run in self._runs.items() if not run.ended]:
+            raise RuntimeError(f"{', '.join(idle)} never became ready: the blocks' needs contradict each other")
         evaluation_key = self._answers.get("evaluate")
         evaluation = None
         if evaluation_key is not None:

@@ -42,7 +42,8 @@ class FakeStages:
         variant: of its training.
         seconds: of a unit, in `PASSES` passes.
         slow: stage whose units take `seconds`; "" for all of them.
-        num_bake_units: of its one cache set.
+        num_bake_units: of each of its cache sets.
+        chained: a second cache set is baked once the first is sealed.
         failing: names of units that always fail.
         killing: names of units whose process is killed, for as long as `folder/kill <name>` holds lives.
         deaf: its passes ask nobody whether to go on.
@@ -54,6 +55,7 @@ class FakeStages:
     seconds: float = 0.0
     slow: str = ""
     num_bake_units: int = 20
+    chained: bool = False
     failing: tuple[str, ...] = ()
     killing: tuple[str, ...] = ()
     deaf: bool = False
@@ -94,7 +96,10 @@ class FakeStages:
         return {"digest": self.digest, "elements": self.key("elements"), "renders": renders}
 
     def _inventory(self, unit: Unit, store: Store) -> dict[str, Any]:
-        lobes = {"diffuse": {"key": self.key("bake"), "num_units": self.num_bake_units, "lanes_per_unit": 1000}}
+        size = {"num_units": self.num_bake_units, "lanes_per_unit": 1000}
+        lobes = {"diffuse": {"key": self.key("bake"), **size}}
+        if self.chained:
+            lobes["directional"] = {"key": self.key("bake", "directional"), **size, "after": "diffuse"}
         inputs = {path: [self.key("inputs", path, i) for i in range(FRAMES[path])] for path in ("train", "validation")}
         return {"lobes": lobes, "inputs": inputs}
 

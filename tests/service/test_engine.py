@@ -63,14 +63,24 @@ def test_job_runs_every_unit_once_and_tells_its_progress(runner: DaskRunner, tmp
     assert watch.of("preview")[0]["png"].startswith(b"\x89PNG")
 
 
-def test_job_run_again_computes_no_stored_unit(runner: DaskRunner, tmp_path: Path) -> None:
-    spec = fake_spec(tmp_path, digest="again")
+@pytest.mark.parametrize("chained", [False, True])
+def test_job_run_again_computes_no_stored_unit(runner: DaskRunner, tmp_path: Path, chained: bool) -> None:
+    spec = fake_spec(tmp_path, digest=f"again-{chained}", chained=chained)
     Watch().run(runner, spec)
     (tmp_path / "started").unlink()
     watch = Watch()
     watch.run(runner, spec)
     assert {name.split()[0] for name, _, _ in started(tmp_path)} == {"census", "inventory", "train", "evaluate"}
     assert [event["done"] for event in watch.of("progress") if event["stage"] == "bake diffuse"] == [20]
+
+
+def test_job_bakes_a_set_once_the_one_before_it_is_sealed(runner: DaskRunner, tmp_path: Path) -> None:
+    first, both = (fake_spec(tmp_path, ("bake",), digest="chained", chained=chained) for chained in (False, True))
+    Watch().run(runner, first)
+    result = Watch().run(runner, both)  # nothing is in flight between the stored set and the one after it
+    assert result["computed"] == 2 + 20 + 1  # census and inventory, and the second set with its seal
+    names = [line.strip() for line in (tmp_path / "ended").read_text().splitlines()]
+    assert names.index("seal diffuse") < min(i for i, name in enumerate(names) if name.startswith("bake directional"))
 
 
 @pytest.mark.parametrize(
