@@ -13,8 +13,8 @@ from storage.caches import CacheSet
 from storage.store import UnitRef
 from workers.bake_kernels import Batch
 from workers.bake_lobes import DIFFUSE, STAGE, TRACED, Lobe, lobes_of
-from workers.cache_filter import filter_directional
 from workers.direction_grids import choose_grids
+from workers.directional_filter import filter_directional
 from workers.elements import ElementSet
 from workers.errors import QuarantinedError
 from workers.gather import load_diffuse

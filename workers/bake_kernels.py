@@ -1,7 +1,8 @@
 """Baking kernels: exitant radiance of cache elements, one launch for a batch of elements.
 
-A launch's lanes are (element, direction, sample) with the sample fastest. Every lane draws from its own PCG32
-stream, chosen by the element's unit seed, its place in the unit and the pass, so that the result does not depend
+A launch's lanes are (element, direction, sample) with the sample fastest. The first vertex draws from low-discrepancy
+sequences that the elements of a unit share (`workers/sequences.py`), the rest of a path from a PCG32 stream of its own;
+both are chosen by the element's unit seed, its place in the unit and the pass, so that the result does not depend
 on how units are grouped into launches; the mean over samples is a block reduction in a fixed order. Both make a
 bake bit-identical when it is run again.
 """
@@ -14,6 +15,7 @@ import numpy as np
 from workers.backend import dr, mi
 from workers.elements import ElementSet
 from workers.lobes import LobeClass, directional_lobes, has, specular_tint
+from workers.sequences import PaddedPoints
 from workers.surfaces import SurfaceTable
 from workers.transport import CachedLobes, exitant_start, incident_radiance, lambertian_start
 
@@ -51,6 +53,18 @@ def _streams(batch: Batch, lanes_per_element: int, bake_pass: int) -> "mi.PCG32"
     v0, v1 = mi.sample_tea_32(high, low, 6)
     # With a size, PCG32 adds the lane's place in the launch to its stream: grouping would change the result.
     return mi.PCG32(1, initstate=mi.UInt64(v0), initseq=mi.UInt64(v1))
+
+
+def _points(batch: Batch, num_texels: int, spp: int, bake_pass: int) -> PaddedPoints:
+    """Points of every lane: sequences a texel, that go on from one element of a unit to the next."""
+    lanes_per_element = num_texels * spp
+    lane = dr.arange(mi.UInt32, len(batch.element) * lanes_per_element)
+    owner = lane // lanes_per_element
+    place = mi.UInt32(dr.gather(mi.UInt64, mi.UInt64(batch.place), owner))
+    texel, sample = lane % lanes_per_element // spp, lane % spp
+    shift = dr.opaque(mi.UInt32, (bake_pass * 0x85EBCA6B) & 0xFFFFFFFF)
+    seed, _ = mi.sample_tea_32(mi.UInt32(dr.gather(mi.UInt64, mi.UInt64(batch.seed), owner)) + shift, texel, 6)
+    return PaddedPoints(place * spp + sample, seed)
 
 
 def _interactions(
@@ -93,21 +107,12 @@ def bake_diffuse(
     Returns:
         (mean, mean of squares), float32 [n, 3] each, linear radiance.
     """
-    si, normal, _, sample = _interactions(table, elements, batch, spp)
+    si, normal, _, _ = _interactions(table, elements, batch, spp)
     rng = _streams(batch, spp, bake_pass)
-    direct, start = lambertian_start(mi_scene, si, normal, rng, _stratum(sample, spp, rng))
+    direct, start = lambertian_start(mi_scene, si, normal, _points(batch, 1, spp, bake_pass))
     value = direct + incident_radiance(mi_scene, start, rng, max_depth, gather)
     dr.eval(value)
     return _block_mean(value, spp), _block_mean(dr.square(value), spp)
-
-
-def _stratum(sample: "mi.UInt32", spp: int, rng: "mi.PCG32") -> "mi.Point2f":
-    """Jittered point of the unit square: a grid over the first columns * rows samples, plain random beyond."""
-    columns = max(int(np.sqrt(spp)), 1)
-    rows = spp // columns
-    jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
-    cell = mi.Point2f(sample % columns, sample // columns)
-    return dr.select(sample < columns * rows, (cell + jitter) / mi.Point2f(columns, rows), jitter)
 
 
 def bake_directional(
@@ -122,7 +127,7 @@ def bake_directional(
         elements: all elements.
         batch: those of this launch.
         grid: (azimuth, polar) directions over the hemisphere around the element's normal.
-        spp: samples per direction, each jittered in its bin.
+        spp: samples per direction, spread over its bin.
         bake_pass: index of the pass.
         max_depth: longest path (camera's count).
         exitant: all of the exitant radiance, emission and delta lobes included (the paper); else the directional
@@ -135,19 +140,19 @@ def bake_directional(
     azimuth, polar = grid
     lanes = azimuth * polar * spp
     si, normal, bits, lane = _interactions(table, elements, batch, lanes)
-    rng = _streams(batch, lanes, bake_pass)
-    view = direction_in_bin(lane // spp, grid, mi.Point2f(rng.next_float32(), rng.next_float32()), normal)
+    rng, points = _streams(batch, lanes, bake_pass), _points(batch, azimuth * polar, spp, bake_pass)
+    view = direction_in_bin(lane // spp, grid, points.next_2d(), normal)
     si.wi = si.to_local(view)
     everything = mi.Bool(True)
     tint = mi.Color3f(1.0)
     if exitant:
         lobes = CachedLobes(mi.BSDFContext(), mi.Color3f(0.0), True, None)
-        direct, start = exitant_start(mi_scene, si, lobes, rng)
+        direct, start = exitant_start(mi_scene, si, lobes, points)
         direct += si.emitter(mi_scene).eval(si)
     else:
         whole = has(bits, LobeClass.WHOLE) if table.lobe_union & LobeClass.WHOLE else None
         lobes = CachedLobes(*directional_lobes(si, bits, table.lobe_union), False, whole)
-        direct, start = exitant_start(mi_scene, si, lobes, rng)
+        direct, start = exitant_start(mi_scene, si, lobes, points)
         tint = specular_tint(si.bsdf(), si, bits, table.lobe_union, everything)
     value = (direct + incident_radiance(mi_scene, start, rng, max_depth, gather)) / tint
     return _block_mean(value, spp).reshape(len(batch.element), polar, azimuth, 3)

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from workers.elements import ElementSet
 
 # Part of the keys of what is made from filtered caches; raise it whenever the filter's result changes.
-FILTER_VERSION = 4
+FILTER_VERSION = 5
 NUM_NEIGHBOURS = 24
 PASSES = 2
 NORMAL_POWER = 16
@@ -38,7 +38,7 @@ def filter_diffuse(elements: ElementSet, mean: np.ndarray, standard_error: np.nd
     Returns:
         float32 [n, 3].
     """
-    index, weight = _neighbours(elements, np.arange(elements.num_elements), SIGMA_SPACINGS)
+    index, weight = neighbours(elements, np.arange(elements.num_elements), SIGMA_SPACINGS)
     variance = np.mean(standard_error.astype(np.float64) ** 2, axis=1)
     values = mean.astype(np.float64)
     for _ in range(PASSES):
@@ -65,36 +65,7 @@ def _filter_once(
     return np.einsum("nk,nkc->nc", total, values[index]), np.sum(total**2 * variance[index], axis=1)
 
 
-def filter_directional(elements: ElementSet, values: np.ndarray, slots: np.ndarray | None = None) -> np.ndarray:
-    """Denoised directional lobe: place and normal alone.
-
-    Args:
-        elements: where the values sit.
-        values: grids of one size, float32 [n, polar, azimuth, 3].
-        slots: place of each row in `ElementSet.glossy`, int64 [n]; None for all of them.
-
-    Returns:
-        float32 [n, polar, azimuth, 3]. Only rows given average each other, but they are neighbours by the spacing of
-        all glossy elements: one of few among other grids is left alone.
-    """
-    if len(values) == 0:
-        return values
-    members = elements.glossy if slots is None else elements.glossy[slots]
-    spacing = None if slots is None else _spacing(elements, elements.glossy)[slots]
-    index, weight = _neighbours(elements, members, SIGMA_SPACINGS_DIRECTIONAL, spacing)
-    weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
-    result = np.empty_like(values)
-    rows_at_once = max(1, FLOATS_AT_ONCE // max(values[0].size, 1))
-    for first in range(0, len(values), rows_at_once):
-        chosen = slice(first, first + rows_at_once)
-        total = np.zeros_like(values[chosen])
-        for k in range(index.shape[1]):
-            total += values[index[chosen, k]] * weight[chosen, k, None, None, None]
-        result[chosen] = total
-    return result
-
-
-def _spacing(elements: ElementSet, members: np.ndarray) -> np.ndarray:
+def element_spacing(elements: ElementSet, members: np.ndarray) -> np.ndarray:
     """Median distance of each member to its nearest ones, float64 [n]."""
     position = elements.position[members].astype(np.float64)
     distance, _ = cKDTree(position).query(position, k=min(5, len(members)), workers=2)
@@ -106,7 +77,7 @@ def _median_distance(distance: np.ndarray) -> np.ndarray:
     return np.maximum(np.median(distance[:, 1:5], axis=1) if distance.shape[1] > 4 else distance[:, -1], 1e-30)
 
 
-def _neighbours(
+def neighbours(
     elements: ElementSet, members: np.ndarray, sigma_spacings: float, spacing: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Nearest members of each member (itself first) and their weights; int64, float64 [n, k]."""

@@ -23,6 +23,7 @@ PROBE_SINE = float(np.sqrt(1 - PROBE_COSINE**2))
 MIN_TINT = 0.02
 TINT_SPREAD = 0.02  # a tint that changes less over a surface is left in the cache
 TINT_PROBES = 1024
+DIELECTRIC_F0 = 0.04  # what a coat adds to a stated diffuse reflectance
 # First random numbers that pick the lobes of a material whose lobes cannot be told apart.
 TINT_LOBES = (0.125, 0.375, 0.625, 0.875)
 
@@ -44,6 +45,7 @@ class LobeClass(IntFlag):
     FRONT_ONLY = 64  # a principled material that is black from behind
     WHOLE = 128  # masks tear its diffuse lobe apart: the directional cache takes every non-delta lobe
     TINTED = 256  # its directionally cached lobe changes colour over the surface: the colour is divided out
+    STATED = 512  # a `WHOLE` one that tells its diffuse reflectance, as principled ones under a normal map do
 
 
 def context(mask: int) -> "mi.BSDFContext":
@@ -71,6 +73,8 @@ def classify_bsdf(bsdf: "mi.BSDF", *, is_emitter: bool = False) -> LobeClass:
     elif lobe & LobeClass.DIFFUSE:
         # A diffuse part that cannot be told apart from the rest is left in the directional lobe.
         lobe = lobe & ~LobeClass.DIFFUSE | LobeClass.GLOSSY | LobeClass.WHOLE
+        if _states_reflectance(bsdf):
+            lobe |= LobeClass.STATED
     if lobe & LobeClass.GLOSSY and _is_tinted(bsdf, lobe):
         lobe |= LobeClass.TINTED
     return lobe
@@ -93,16 +97,30 @@ def _is_maskable(bsdf: "mi.BSDF") -> bool:
     return separate and bool(np.allclose(diffuse + glossy, everything, rtol=1e-3, atol=1e-6))
 
 
+def _states_reflectance(bsdf: "mi.BSDF") -> bool:
+    """Whether `eval_diffuse_reflectance` is the material's own, not Mitsuba's guess from one pair of directions."""
+    si = _places(3)
+    si.wi = dr.normalize(mi.Vector3f([0.0, 0.8, -0.3], [0.0, 0.1, 0.9], [1.0, 0.5, 0.2]))
+    stated = np.array(bsdf.eval_diffuse_reflectance(si))
+    return bool(np.isfinite(stated).all() and stated.max() <= 1.0 and np.allclose(stated, stated[:, :1], rtol=1e-4))
+
+
+def _places(count: int) -> "mi.SurfaceInteraction3f":
+    """Interactions at the origin of a plane, seen along its normal."""
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.n, si.dp_du, si.dp_dv = mi.Normal3f(0, 0, 1), mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+    si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
+    si.wi = mi.Vector3f(0, 0, 1)
+    return si
+
+
 def _is_tinted(bsdf: "mi.BSDF", lobe: LobeClass) -> bool:
     """Whether the tint differs between random places of the texture."""
     if not any(key.endswith("to_uv") for key in mi.traverse(bsdf).keys()):  # noqa: SIM118  # it yields pairs
         return False
     rng = np.random.default_rng(0)
-    si = dr.zeros(mi.SurfaceInteraction3f, TINT_PROBES)
+    si = _places(TINT_PROBES)
     si.uv = mi.Point2f(rng.random((2, TINT_PROBES), dtype=np.float32))
-    si.n, si.dp_du, si.dp_dv = mi.Normal3f(0, 0, 1), mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
-    si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
-    si.wi = mi.Vector3f(0, 0, 1)
     bits = dr.full(mi.UInt32, int(lobe), TINT_PROBES)
     tint = np.array(_sampled_tint(mi.BSDFPtr(bsdf), si, bits, lobe, mi.Bool(True)))
     return bool(np.any(np.ptp(tint, axis=1) > TINT_SPREAD * tint.max()))
@@ -146,7 +164,8 @@ def principled_parameters(
     bsdf: "mi.BSDFPtr", si: "mi.SurfaceInteraction3f", active: "mi.Bool"
 ) -> "tuple[mi.Color3f, mi.Float, mi.Float]":
     """Base colour, metallic and specular transmission of principled materials (0 where absent)."""
-    base = bsdf.eval_attribute_3("base_color", si, active)
+    # Not as an attribute: grey bitmaps and checkerboards have none of three channels.
+    base = bsdf.eval_diffuse_reflectance(si, active)
     metallic = bsdf.eval_attribute_1("metallic", si, active & bsdf.has_attribute("metallic", active))
     transmissive = active & bsdf.has_attribute("spec_trans", active)
     transmission = bsdf.eval_attribute_1("spec_trans", si, transmissive)
@@ -163,7 +182,8 @@ def specular_tint(
     """t_s(x, wo): the colour by which the directional lobe is divided in the cache; 1 where it has none.
 
     Schlick's Fresnel of a principled material (its metals take their colour from a texture); of another one whose
-    colour changes over the surface, what it reflects of a viewer along the normal. The split is exact for any tint, as
+    colour changes over the surface, what it reflects of a viewer along the normal, or the diffuse reflectance that it
+    states. The split is exact for any tint, as
     long as cache and pixel agree on it; a good one keeps textures out of the cache.
     """
     tint = dr.full(mi.Color3f, 1.0, dr.width(si))
@@ -189,8 +209,12 @@ def _sampled_tint(
     probe.wi = mi.Vector3f(0.0, 0.0, dr.select(si.wi.z < 0, -1.0, 1.0))
     middle = mi.Point2f(0.5)
     _, weight = bsdf.sample(context(DIRECTIONAL_MASK), probe, mi.Float(0.5), middle, active)
+    if union & LobeClass.STATED:
+        stated = active & has(bits, LobeClass.STATED)
+        weight = dr.select(stated, bsdf.eval_diffuse_reflectance(probe, stated) + DIELECTRIC_F0, weight)
     if union & LobeClass.WHOLE:
-        whole, total = active & has(bits, LobeClass.WHOLE), dr.zeros(mi.Color3f, dr.width(si))
+        whole = active & has(bits, LobeClass.WHOLE) & ~has(bits, LobeClass.STATED)
+        total = dr.zeros(mi.Color3f, dr.width(si))
         for pick in TINT_LOBES:
             total += bsdf.sample(context(SMOOTH_MASK), probe, mi.Float(pick), middle, whole)[1]
         weight = dr.select(whole, total / len(TINT_LOBES), weight)

@@ -5,16 +5,16 @@ from typing import Any
 PRESET_OVERRIDES: dict[str, dict[str, Any]] = {
     "draft": {},
     "balanced": {
-        "cache.max_elements": 150_000, "cache.diffuse_spp": 4096, "cache.directional_spp": 16,
+        "cache.max_elements": 150_000, "cache.diffuse_spp": 4096, "cache.directional_spp": 4,
         "frames.num_train": 72, "frames.num_validation": 8, "frames.num_test": 12, "frames.train_spp": 256,
         "frames.test_spp": 4096, "train.seconds": 3600.0, "train.epochs": 1000, "train.widths": (32, 48, 64),
         "plan.noise": 0.03,
     },
     "reference": {
-        "cache.max_elements": 400_000, "cache.diffuse_spp": 16_384, "cache.azimuth": 64, "cache.polar": 16,
-        "cache.directional_spp": 32, "frames.num_train": 90, "frames.num_validation": 10, "frames.num_test": 200,
-        "frames.train_spp": 4000, "frames.denoise_train": False, "frames.test_spp": 4000,
-        "train.seconds": 0.0, "train.epochs": 1000, "train.widths": (48, 64, 96), "plan.noise": 0.015,
+        "cache.max_elements": 400_000, "cache.diffuse_spp": 16_384, "cache.directional_spp": 32,
+        "frames.num_train": 90, "frames.num_validation": 10, "frames.num_test": 200, "frames.train_spp": 4000,
+        "frames.denoise_train": False, "frames.test_spp": 4000, "train.seconds": 0.0, "train.epochs": 1000,
+        "train.widths": (48, 64, 96), "plan.noise": 0.015,
     },
     "demo": {
         "width": 256, "height": 256, "cache.max_elements": 40_000, "cache.diffuse_spp": 512,

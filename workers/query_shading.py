@@ -235,13 +235,14 @@ class _AskedOnce:
     def eval_attribute_1(self, name, si, active):
         return self._ask("eval_attribute_1", name, si, active)
 
-    def eval_attribute_3(self, name, si, active):
-        return self._ask("eval_attribute_3", name, si, active)
+    def eval_diffuse_reflectance(self, si, active):
+        return self._ask("eval_diffuse_reflectance", si, active)
 
-    def _ask(self, method: str, name: str, *where):
-        if (method, name) not in self._known:
-            self._known[method, name] = getattr(self._bsdf, method)(name, *where)
-        return self._known[method, name]
+    def _ask(self, method: str, *arguments):
+        key = (method, *(argument for argument in arguments if isinstance(argument, str)))
+        if key not in self._known:
+            self._known[key] = getattr(self._bsdf, method)(*arguments)
+        return self._known[key]
 
 
 def _interleaved(first: np.ndarray, second: np.ndarray) -> np.ndarray:

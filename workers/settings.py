@@ -58,9 +58,9 @@ class CacheSettings:
     domain_poses: int = 40
     diffuse_spp: int = 2048
     grids: Literal["uniform", "adaptive"] = "adaptive"
-    azimuth: int = 32
-    polar: int = 8
-    directional_spp: int = 8
+    azimuth: int = 64
+    polar: int = 16
+    directional_spp: int = 2
     gather: Literal["caches", "paths"] = "caches"
     texels: Literal["float32", "rgb9e5"] = "rgb9e5"
     passes: int = 1

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from workers.backend import dr, mi
 from workers.lobes import SMOOTH_MASK, context
+from workers.sequences import PaddedPoints
 
 if TYPE_CHECKING:
     from workers.gather import DiffuseGather
@@ -21,7 +22,7 @@ RR_DEPTH = 5
 # Mitsuba's own 0.95 has infinite variance in a closed box of albedo 0.99: a bounce multiplies the mean of the squared
 # weight by albedo^2 / survival, which must stay below 1.
 RR_MAX_SURVIVAL = 0.99
-TRANSPORT_VERSION = 3  # part of the keys of what is baked; raise it whenever the estimator gives other values
+TRANSPORT_VERSION = 4  # part of the keys of what is baked; raise it whenever the estimator gives other values
 UNLIMITED_DEPTH = 0xFFFFFFFF
 
 
@@ -139,8 +140,7 @@ def incident_radiance(
 
 
 def lambertian_start(
-    scene: "mi.Scene", si: "mi.SurfaceInteraction3f", normal: "mi.Vector3f", rng: "mi.PCG32",
-    stratum: "mi.Point2f",
+    scene: "mi.Scene", si: "mi.SurfaceInteraction3f", normal: "mi.Vector3f", points: PaddedPoints
 ) -> tuple["mi.Color3f", PathStart]:  # fmt: skip
     """First vertex with a white Lambertian lobe: next-event estimate of E / pi, and the path's start.
 
@@ -148,19 +148,16 @@ def lambertian_start(
         scene: the scene.
         si: the cached point.
         normal: unit normal of the cached side.
-        rng: random numbers; advanced.
-        stratum: point of the unit square that picks the cosine-weighted direction.
+        points: of light and direction; advanced.
     """
     frame = mi.Frame3f(normal)
-    ds, radiance = scene.sample_emitter_direction(
-        si, mi.Point2f(rng.next_float32(), rng.next_float32()), True, mi.Bool(True)
-    )
+    ds, radiance = scene.sample_emitter_direction(si, points.next_2d(), True, mi.Bool(True))
     cosine = dr.maximum(dr.dot(ds.d, normal), 0.0)
     lit = (ds.pdf != 0.0) & (cosine > 0.0)
     weight = dr.select(ds.delta, 1.0, power_heuristic(ds.pdf, cosine * dr.inv_pi))
     direct = dr.select(lit, radiance * (cosine * dr.inv_pi * weight), 0.0)
 
-    local = mi.warp.square_to_cosine_hemisphere(stratum)
+    local = mi.warp.square_to_cosine_hemisphere(points.next_2d())
     direction = frame.to_world(local)
     start = PathStart(
         ray=si.spawn_ray(direction),
@@ -175,7 +172,7 @@ def lambertian_start(
 
 
 def exitant_start(
-    scene: "mi.Scene", si: "mi.SurfaceInteraction3f", lobes: "CachedLobes", rng: "mi.PCG32",
+    scene: "mi.Scene", si: "mi.SurfaceInteraction3f", lobes: "CachedLobes", points: PaddedPoints
 ) -> tuple["mi.Color3f", PathStart]:  # fmt: skip
     """First vertex with the cached lobes of its own material, seen from `si.wi`.
 
@@ -183,15 +180,12 @@ def exitant_start(
         scene: the scene.
         si: the cached point; `si.wi` is the local direction to the viewer.
         lobes: which part of the material is cached.
-        rng: random numbers; advanced.
+        points: of light, lobe and direction; advanced.
     """
     bsdf = si.bsdf()
-    ds, radiance = scene.sample_emitter_direction(
-        si, mi.Point2f(rng.next_float32(), rng.next_float32()), True, mi.Bool(True)
-    )
+    ds, radiance = scene.sample_emitter_direction(si, points.next_2d(), True, mi.Bool(True))
     wo = si.to_local(ds.d)
-    sample_1 = rng.next_float32()
-    sample_2 = mi.Point2f(rng.next_float32(), rng.next_float32())
+    sample_1, sample_2 = points.next_1d(), points.next_2d()
     value, pdf, bs, weight = bsdf.eval_pdf_sample(lobes.ctx, si, wo, sample_1, sample_2, mi.Bool(True))
     if lobes.whole is not None:
         smooth = context(SMOOTH_MASK)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.exr_files import write_exr
 from workers.backend import mi
 from workers.bake_kernels import Batch, bake_diffuse
 from workers.camera import Camera
@@ -108,7 +109,7 @@ def test_texture_that_is_not_finite_is_refused_by_name(make_scene: Any, tmp_path
     texels = np.full((4, 4, 3), 0.5, np.float32)
     texels[1, 2] = bad
     file = tmp_path / "texture.exr"
-    mi.Bitmap(texels).write(str(file))
+    write_exr(file, texels)
     if where == "floor":
         texture = {"type": "bitmap", "filename": str(file), "raw": True}
         more = {"floor": {"type": "rectangle", "b": {"type": "diffuse", "reflectance": texture}}}

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.exr_files import write_exr
 from workers.backend import mi
 
 _POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4")
@@ -112,7 +113,7 @@ def write_plugin_scene(folder: Path, tag: str, name: str) -> Path:
 def _write_files(folder: Path) -> None:
     grey = np.full((4, 4, 3), 0.5, np.float32)
     mi.util.write_bitmap(str(folder / "picture.png"), grey, write_async=False)
-    mi.util.write_bitmap(str(folder / "sky.exr"), grey, write_async=False)
+    write_exr(folder / "sky.exr", grey)
     (folder / "mesh.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     (folder / "mesh.ply").write_text(_ply("x y z", ["0 0 0", "1 0 0", "0 1 0"], faces=["3 0 1 2"]))
     ellipsoid = "x y z nx ny nz scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from workers.cache_filter import filter_diffuse, filter_directional
+from workers.cache_filter import filter_diffuse
+from workers.directional_filter import filter_directional
 from workers.elements import ElementSet
 from workers.lattice import build_patch_table
 
@@ -71,6 +72,48 @@ def test_filter_never_mixes_other_surfaces(plane: ElementSet, attribute: str) ->
     filtered = filter_diffuse(apart, value, np.full_like(value, 100.0))
     np.testing.assert_allclose(filtered, value, atol=1e-6)
     np.testing.assert_allclose(filter_directional(apart, value[:, None, None, :])[:, 0, 0], value, atol=1e-6)
+
+
+def noisy_grids(elements: ElementSet, sigma: float, seed: int = 1) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return (1 + sigma * rng.normal(size=(elements.num_elements, 4, 8, 1)) * np.ones(3)).astype(np.float32)
+
+
+def test_directional_filter_removes_nearly_all_noise_of_a_flat_field(plane: ElementSet) -> None:
+    filtered = filter_directional(plane, noisy_grids(plane, 0.5))
+    assert filtered.std() < 0.5 / 8
+    assert abs(filtered.mean() - 1.0) < 0.01
+
+
+def test_directional_filter_keeps_a_reflection_s_edge(plane: ElementSet) -> None:
+    """In half of the directions a light is seen from one half of the plane alone; the noise is a tenth of it."""
+    lit = np.zeros((plane.num_elements, 4, 8, 1), np.float32)
+    lit[plane.position[:, 0] >= SIDE // 2, :, :4] = 10.0
+    filtered = filter_directional(plane, noisy_grids(plane, 1.0) + lit)
+    error = np.abs(filtered - 1 - lit)
+    away = np.abs(plane.position[:, 0] - SIDE / 2 + 0.5) > 2
+    assert error[away].max() < 1.5 and np.sqrt(np.mean(error[away] ** 2)) < 0.25
+    near = filtered[~away].reshape(-1, 4, 8, 3)[:, :, 1:3].mean()
+    assert 4.5 < near < 7.5  # on both sides of the edge together: nothing is lost
+
+
+def test_directional_filter_shares_out_a_firefly(plane: ElementSet) -> None:
+    values = noisy_grids(plane, 0.1)
+    values[SIDE * SIDE // 2 + SIDE // 2, 2, 3] = 1e4
+    filtered = filter_directional(plane, values)
+    assert filtered.max() < 2e3
+    assert filtered.sum() == pytest.approx(values.sum(), rel=0.3)
+
+
+@pytest.mark.parametrize("scale", [1e-20, 1e-8, 1e8, 1e20])
+def test_directional_filter_does_not_depend_on_the_unit_of_radiance(plane: ElementSet, scale: float) -> None:
+    values = noisy_grids(plane, 0.5)
+    exact = np.float32(2.0 ** np.round(np.log2(scale)))
+    np.testing.assert_array_equal(filter_directional(plane, values * exact), filter_directional(plane, values) * exact)
+
+
+def test_directional_filter_of_darkness_is_dark(plane: ElementSet) -> None:
+    assert np.all(filter_directional(plane, np.zeros((plane.num_elements, 2, 8, 3), np.float32)) == 0)
 
 
 def test_filter_of_few_elements_is_finite(plane: ElementSet) -> None:

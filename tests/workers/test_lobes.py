@@ -27,6 +27,7 @@ MATERIALS: dict[str, dict[str, Any]] = {
     "thindielectric": {"type": "thindielectric"},
     "roughdielectric": {"type": "roughdielectric", "alpha": 0.3},
     "principled": PRINCIPLED,
+    "tiled_principled": {"type": "principled", "base_color": TILES, "roughness": 0.4},
     "principled_twosided": {"type": "twosided", "bsdf": PRINCIPLED},
     "mask": {"type": "mask", "opacity": 0.3, "bsdf": DIFFUSE},
     "mask_principled": {"type": "mask", "opacity": 0.3, "bsdf": PRINCIPLED},
@@ -39,6 +40,14 @@ MATERIALS: dict[str, dict[str, Any]] = {
         "weight": 0.3,
         "a": {"type": "diffuse", "reflectance": TILES},
         "b": PRINCIPLED,
+    },
+    "tiled_normalmap": {
+        "type": "twosided",
+        "bsdf": {
+            "type": "normalmap",
+            "normalmap": {"type": "bitmap", "raw": True, "data": mi.TensorXf(np.full((2, 2, 3), (0.5, 0.5, 1.0)))},
+            "bsdf": {"type": "principled", "base_color": TILES, "roughness": 0.4},
+        },
     },
 }
 D, G, DELTA, M, P = (
@@ -55,14 +64,16 @@ CLASSES = {
     "thindielectric": DELTA,
     "roughdielectric": G,
     "principled": D | G | P | LobeClass.FRONT_ONLY,
+    "tiled_principled": D | G | P | LobeClass.FRONT_ONLY,
     "principled_twosided": D | G | P,
     "mask": D | M | DELTA,
-    "mask_principled": G | DELTA | LobeClass.WHOLE,
+    "mask_principled": G | DELTA | LobeClass.WHOLE | LobeClass.STATED,
     "blend": D | M | G,
-    "blend_principled": G | LobeClass.WHOLE,
+    "blend_principled": G | LobeClass.WHOLE | LobeClass.STATED,
     "tiled_metal": G | LobeClass.TINTED,
     "scratched_metal": G,
-    "tiled_blend": G | LobeClass.WHOLE | LobeClass.TINTED,
+    "tiled_blend": G | LobeClass.WHOLE | LobeClass.TINTED | LobeClass.STATED,
+    "tiled_normalmap": G | LobeClass.WHOLE | LobeClass.TINTED | LobeClass.STATED,
 }
 COSINES = np.array([1.0, 0.9, 0.6, 0.3, 0.1], np.float32)
 
@@ -114,6 +125,10 @@ def test_diffuse_reflectance_is_the_albedo_of_the_diffuse_lobe(
     for sign, share in ((1, front), (-1, back)):
         rho = reflectance(bsdfs[name], seen_from(sign * COSINES))
         np.testing.assert_allclose(rho, np.broadcast_to(np.multiply(BASE, share), rho.shape), atol=1e-6)
+
+
+def test_diffuse_reflectance_of_a_principled_texture_without_three_channels(bsdfs: Materials) -> None:
+    np.testing.assert_allclose(reflectance(bsdfs["tiled_principled"], seen_from(COSINES)), 0.8, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["plastic", "roughplastic"])
@@ -169,6 +184,16 @@ def test_specular_tint_of_tiles_is_their_reflectance(bsdfs: Materials, side: int
     assert np.ptp(light, axis=0).max() < 1e-6 and 0.3 < light.min() < light.max() < 0.8
     if side == 1:  # behind, the blend is black
         assert np.all(tints["tiled_blend"][0] > 1.3 * tints["tiled_blend"][1])
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_specular_tint_of_a_hidden_principled_is_its_base_colour(bsdfs: Materials, side: int) -> None:
+    bits = classify_bsdf(bsdfs["tiled_normalmap"])
+    si = seen_from(side * COSINES)
+    for v, base in ((0.25, 0.8), (0.75, 0.2)):
+        si.uv = mi.Point2f(0.25, v)
+        tint = specular_tint(mi.BSDFPtr(bsdfs["tiled_normalmap"]), si, mi.UInt32(int(bits)), bits, mi.Bool(True))
+        np.testing.assert_allclose(np.array(tint), base + 0.04, rtol=1e-5)
 
 
 def test_specular_tint_is_one_where_nothing_is_divided(bsdfs: Materials) -> None:
