@@ -23,6 +23,8 @@ NUM_FAR = 12
 MAX_SIGMAS = 2.5
 RANGE_STRENGTH = 8.0
 WINDOW = 9  # texels of a comparison
+HALO = 1 + len(FAR_PASSES)  # rows of directions beside a texel's own that its result depends on: one a pass
+TEXELS_AT_ONCE = 1 << 26  # some 3 GB in device memory
 TINY = 1e-30
 
 
@@ -51,11 +53,16 @@ def filter_directional(elements: ElementSet, values: np.ndarray, slots: np.ndarr
         return values
     # Squares of radiance must neither overflow nor vanish: the largest value becomes about 1, exactly.
     exponent = int(np.frexp(float(np.abs(values).max(initial=0.0)))[1])
-    scaled = np.ldexp(values, -exponent) if exponent else values
-    texels = _Texels(scaled, polar, azimuth)
-    for one in _passes(elements, slots, np.pi / 2 / polar):
-        texels.average(one)
-    result = texels.numpy()
+    passes = _passes(elements, slots, np.pi / 2 / polar)
+    result = np.empty_like(values)
+    whole = values[..., 0].size <= TEXELS_AT_ONCE
+    band = polar if whole else max(TEXELS_AT_ONCE // (rows * azimuth) - 2 * HALO, 1)
+    for start in range(0, polar, band):
+        low, high = max(start - HALO, 0), min(start + band + HALO, polar)
+        texels = _Texels(np.ldexp(values[:, low:high], -exponent))
+        for one in passes:
+            texels.average(one)
+        result[:, start : start + band] = texels.numpy()[:, start - low : start - low + band]
     return np.ldexp(result, exponent, out=result)
 
 
@@ -96,7 +103,8 @@ def _far(
 class _Texels:
     """The texels of some rows in device memory, with the noise that is left in them."""
 
-    def __init__(self, values: np.ndarray, polar: int, azimuth: int) -> None:
+    def __init__(self, values: np.ndarray) -> None:
+        polar, azimuth = values.shape[1:3]
         self._count = polar * azimuth
         self._polar, self._azimuth = dr.opaque(mi.UInt32, polar), dr.opaque(mi.UInt32, azimuth)
         self._lane = dr.arange(mi.UInt32, len(values) * self._count)

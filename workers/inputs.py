@@ -11,6 +11,7 @@ from workers.bake import bake_refs
 from workers.cache_filter import FILTER_VERSION
 from workers.camera import Camera
 from workers.elements import ElementSet
+from workers.normal_maps import NORMAL_MAPS_VERSION
 from workers.query import CHANNELS, QueryProgram
 from workers.run_state import RunState, camera_params
 
@@ -29,6 +30,8 @@ def inputs_ref(run: RunState, elements: ElementSet, camera: Camera) -> UnitRef:
         "demodulate": cache.demodulate,
         "denoise": FILTER_VERSION if cache.denoise else 0,
     }
+    if run.table.normal_maps.textures:
+        params["normal_maps"] = NORMAL_MAPS_VERSION
     return run.ref(STAGE, params)
 
 

@@ -24,8 +24,8 @@ MIN_TINT = 0.02
 TINT_SPREAD = 0.02  # a tint that changes less over a surface is left in the cache
 TINT_PROBES = 1024
 DIELECTRIC_F0 = 0.04  # what a coat adds to a stated diffuse reflectance
-# First random numbers that pick the lobes of a material whose lobes cannot be told apart.
-TINT_LOBES = (0.125, 0.375, 0.625, 0.875)
+# First random numbers, of a sample's two, that pick a lobe or a blended material.
+TINT_PICKS = tuple((pick + 0.5) / 8 for pick in range(8))
 
 
 # Null: without it a `mask` material samples nothing but its hole; what hits the hole is dropped as delta.
@@ -46,6 +46,7 @@ class LobeClass(IntFlag):
     WHOLE = 128  # masks tear its diffuse lobe apart: the directional cache takes every non-delta lobe
     TINTED = 256  # its directionally cached lobe changes colour over the surface: the colour is divided out
     STATED = 512  # a `WHOLE` one that tells its diffuse reflectance, as principled ones under a normal map do
+    PICKED = 1024  # a `TINTED` one whose samples depend on the number that picks the lobe, as those of blends do
 
 
 def context(mask: int) -> "mi.BSDFContext":
@@ -75,8 +76,8 @@ def classify_bsdf(bsdf: "mi.BSDF", *, is_emitter: bool = False) -> LobeClass:
         lobe = lobe & ~LobeClass.DIFFUSE | LobeClass.GLOSSY | LobeClass.WHOLE
         if _states_reflectance(bsdf):
             lobe |= LobeClass.STATED
-    if lobe & LobeClass.GLOSSY and _is_tinted(bsdf, lobe):
-        lobe |= LobeClass.TINTED
+    if lobe & LobeClass.GLOSSY:
+        lobe |= _tint_class(bsdf, lobe)
     return lobe
 
 
@@ -114,16 +115,25 @@ def _places(count: int) -> "mi.SurfaceInteraction3f":
     return si
 
 
-def _is_tinted(bsdf: "mi.BSDF", lobe: LobeClass) -> bool:
-    """Whether the tint differs between random places of the texture."""
+def _tint_class(bsdf: "mi.BSDF", lobe: LobeClass) -> LobeClass:
+    """`TINTED` where the tint differs between random places of the texture, and how it is to be sampled."""
     if not any(key.endswith("to_uv") for key in mi.traverse(bsdf).keys()):  # noqa: SIM118  # it yields pairs
-        return False
+        return LobeClass(0)
     rng = np.random.default_rng(0)
     si = _places(TINT_PROBES)
     si.uv = mi.Point2f(rng.random((2, TINT_PROBES), dtype=np.float32))
-    bits = dr.full(mi.UInt32, int(lobe), TINT_PROBES)
-    tint = np.array(_sampled_tint(mi.BSDFPtr(bsdf), si, bits, lobe, mi.Bool(True)))
-    return bool(np.any(np.ptp(tint, axis=1) > TINT_SPREAD * tint.max()))
+    found, pointer = LobeClass.TINTED, mi.BSDFPtr(bsdf)
+    if not lobe & LobeClass.STATED and (lobe & LobeClass.WHOLE or _depends_on_pick(pointer, si)):
+        found |= LobeClass.PICKED
+    bits = dr.full(mi.UInt32, int(lobe | found), TINT_PROBES)
+    tint = np.array(_sampled_tint(pointer, si, bits, lobe | found, mi.Bool(True)))
+    return found if np.any(np.ptp(tint, axis=1) > TINT_SPREAD * tint.max()) else LobeClass(0)
+
+
+def _depends_on_pick(bsdf: "mi.BSDFPtr", si: "mi.SurfaceInteraction3f") -> bool:
+    glossy = context(DIRECTIONAL_MASK)
+    weights = [np.array(bsdf.sample(glossy, si, mi.Float(pick), mi.Point2f(0.5))[1]) for pick in TINT_PICKS]
+    return not all(np.allclose(weight, weights[0], rtol=1e-3, equal_nan=True) for weight in weights)
 
 
 def has(bits: "mi.UInt32", lobe: LobeClass) -> "mi.Bool":
@@ -208,16 +218,19 @@ def _sampled_tint(
     probe = mi.SurfaceInteraction3f(si)
     probe.wi = mi.Vector3f(0.0, 0.0, dr.select(si.wi.z < 0, -1.0, 1.0))
     middle = mi.Point2f(0.5)
-    _, weight = bsdf.sample(context(DIRECTIONAL_MASK), probe, mi.Float(0.5), middle, active)
+    once = active & ~(has(bits, LobeClass.PICKED) | has(bits, LobeClass.STATED))
+    _, weight = bsdf.sample(context(DIRECTIONAL_MASK), probe, mi.Float(0.5), middle, once)
     if union & LobeClass.STATED:
         stated = active & has(bits, LobeClass.STATED)
         weight = dr.select(stated, bsdf.eval_diffuse_reflectance(probe, stated) + DIELECTRIC_F0, weight)
-    if union & LobeClass.WHOLE:
-        whole = active & has(bits, LobeClass.WHOLE) & ~has(bits, LobeClass.STATED)
-        total = dr.zeros(mi.Color3f, dr.width(si))
-        for pick in TINT_LOBES:
-            total += bsdf.sample(context(SMOOTH_MASK), probe, mi.Float(pick), middle, whole)[1]
-        weight = dr.select(whole, total / len(TINT_LOBES), weight)
+    if union & LobeClass.PICKED:
+        picked, total = active & has(bits, LobeClass.PICKED), dr.zeros(mi.Color3f, dr.width(si))
+        whole = has(bits, LobeClass.WHOLE)
+        for pick in TINT_PICKS:
+            total += bsdf.sample(context(DIRECTIONAL_MASK), probe, mi.Float(pick), middle, picked & ~whole)[1]
+            if union & LobeClass.WHOLE:
+                total += bsdf.sample(context(SMOOTH_MASK), probe, mi.Float(pick), middle, picked & whole)[1]
+        weight = dr.select(picked, total / len(TINT_PICKS), weight)
     return dr.clip(dr.select(dr.isfinite(weight), weight, 1.0), MIN_TINT, 1.0)
 
 

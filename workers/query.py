@@ -91,9 +91,9 @@ class QueryProgram:
             camera: the pose and size.
 
         Returns:
-            float32 [height, width, NUM_CHANNELS]; channels by `CHANNELS`. IR in linear scene radiance,
-            normals unit and towards the viewer (0 on a miss), albedo in [0, 1], distance in scene units (0
-            on a miss), coverage the share of radiance lookups answered by baked elements, position the first
+            float32 [height, width, NUM_CHANNELS]; channels by `CHANNELS`. IR in linear scene radiance, normals
+            unit, turned by normal maps and towards the viewer (0 on a miss), albedo in [0, 1], distance in scene
+            units (0 on a miss), coverage the share of radiance lookups answered by baked elements, position the first
             sample's hit in scene units from `WorldFrame.origin` (NaN on a miss).
         """
         width, height = camera.width, camera.height
@@ -197,11 +197,14 @@ class QueryProgram:
         if self.follows_delta:
             light = self._follow(light, si, hit & has(shaded.bits, LobeClass.DELTA))
         radiance, albedo, covered, asked = light
+        normal = si.sh_frame.n
+        if self.table.normal_maps.textures:
+            normal = self.table.normal_maps.normal(si, self.table.shape_index(si, hit), hit)
         facing = dr.sign(-dr.dot(si.n, ray.d))
         return _Walk(
             radiance=radiance,
             albedo=albedo,
-            normal=mi.Vector3f(dr.select(hit, si.sh_frame.n * facing, 0.0)),
+            normal=mi.Vector3f(dr.select(hit, normal * facing, 0.0)),
             distance=dr.select(hit, si.t, 0.0),
             position=mi.Point3f(dr.select(hit, si.p, dr.nan)),
             covered=covered,

@@ -52,7 +52,7 @@ class HitRecords:
         distance: along the ray in scene units, float64 [n].
         prim_size: square root of |dp/du x dp/dv|, float64 [n].
         rho, tint, emission: rho_d, t_s and emitted radiance (the environment's on a miss); float64 [n, 3].
-        albedo: for the G-buffer; float64 [n, 3].
+        albedo, mapped_normal: for the G-buffer; float64 [n, 3] each.
     """
 
     si: "mi.SurfaceInteraction3f"
@@ -71,6 +71,7 @@ class HitRecords:
     rho: np.ndarray
     tint: np.ndarray
     albedo: np.ndarray
+    mapped_normal: np.ndarray
     emission: np.ndarray
 
 
@@ -121,6 +122,7 @@ def trace(mi_scene: "mi.Scene", table: SurfaceTable, origin: np.ndarray, directi
         rho=np.where(hit[:, None], _rows(rho), 0.0),
         tint=np.where(hit[:, None], _rows(tint), 1.0),
         albedo=np.where(hit[:, None], _rows(shown_albedo(rho, tint, device_bits, table.lobe_union)), 0.0),
+        mapped_normal=np.where(miss[:, None], 0.0, _rows(table.normal_maps.normal(si, index, valid))),
         emission=_rows(si.emitter(mi_scene).eval(si)),
     )
 
@@ -221,7 +223,7 @@ class _Query:
         return {
             "ir": radiance,
             "albedo": albedo,
-            "normal": hits.normal * hits.facing[:, None],
+            "normal": hits.mapped_normal * hits.facing[:, None],
             "distance": hits.distance[:, None],
             "position": np.where(hits.valid[:, None], hits.position, np.nan),
             "baked": baked,

@@ -83,7 +83,8 @@ class CacheShading:
         table = self.table
         arrays = tuple(value for value in vars(self).values() if dr.is_array_v(value))
         arrays += (self.directional.texels,)
-        return arrays, self.scene, table.index_of_registry, table.prim_offset_dr, table.lobe_bits_dr
+        maps = (table.normal_maps.textures, table.normal_maps.numbers)
+        return arrays, self.scene, table.index_of_registry, table.prim_offset_dr, table.lobe_bits_dr, maps
 
     def shade(self, pi, si, active) -> Shaded:
         """Answers the interactions `si` of intersections `pi`; adds emission, also that of the sky."""

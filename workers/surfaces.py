@@ -13,6 +13,7 @@ import numpy as np
 from workers.backend import dr, mi
 from workers.errors import SceneError
 from workers.lobes import LobeClass, classify_bsdf
+from workers.normal_maps import NormalMaps
 from workers.world_frame import OWN, WorldFrame
 
 PARAMETRIC_SHAPES = ("Disk", "Sphere", "Cylinder")
@@ -33,6 +34,7 @@ class SurfaceTable:
         index_of_registry: stable shape index by registry id; mi.UInt32.
         prim_offset_dr: `prim_offset` on the device; mi.UInt32.
         lobe_bits_dr: `LobeClass` bits by stable shape index; mi.UInt32.
+        normal_maps: of the shapes.
         diagonal: of the scene's bounding box.
         frame: where the scene lies; every length and place here is in that frame's local units.
     """
@@ -46,6 +48,7 @@ class SurfaceTable:
     index_of_registry: "mi.UInt32"
     prim_offset_dr: "mi.UInt32"
     lobe_bits_dr: "mi.UInt32"
+    normal_maps: NormalMaps
     diagonal: float
     frame: WorldFrame = OWN
 
@@ -159,6 +162,7 @@ def build_surface_table(mi_scene: "mi.Scene", frame: WorldFrame = OWN) -> Surfac
         index_of_registry=mi.UInt32(lookup),
         prim_offset_dr=mi.UInt32(offset.astype(np.uint32)),
         lobe_bits_dr=mi.UInt32(np.array([int(lobe) for lobe in lobes], np.uint32)),
+        normal_maps=NormalMaps(shapes),
         diagonal=float(dr.norm(mi_scene.bbox().extents())),
         frame=frame,
     )

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from workers import directional_filter
 from workers.cache_filter import filter_diffuse
 from workers.directional_filter import filter_directional
 from workers.elements import ElementSet
@@ -110,6 +111,13 @@ def test_directional_filter_does_not_depend_on_the_unit_of_radiance(plane: Eleme
     values = noisy_grids(plane, 0.5)
     exact = np.float32(2.0 ** np.round(np.log2(scale)))
     np.testing.assert_array_equal(filter_directional(plane, values * exact), filter_directional(plane, values) * exact)
+
+
+def test_directional_filter_in_bands_is_that_of_the_whole(plane: ElementSet, monkeypatch: pytest.MonkeyPatch) -> None:
+    values = np.tile(noisy_grids(plane, 0.5), (1, 4, 1, 1)) + np.arange(16, dtype=np.float32)[:, None, None]
+    whole = filter_directional(plane, values)
+    monkeypatch.setattr(directional_filter, "TEXELS_AT_ONCE", plane.num_elements * 8 * 9)
+    np.testing.assert_allclose(filter_directional(plane, values), whole, rtol=1e-6)
 
 
 def test_directional_filter_of_darkness_is_dark(plane: ElementSet) -> None:

@@ -41,6 +41,7 @@ MATERIALS: dict[str, dict[str, Any]] = {
         "a": {"type": "diffuse", "reflectance": TILES},
         "b": PRINCIPLED,
     },
+    "tiled_weight": {"type": "blendbsdf", "weight": TILES, "a": DIFFUSE, "b": ROUGH_METAL},
     "tiled_normalmap": {
         "type": "twosided",
         "bsdf": {
@@ -73,6 +74,7 @@ CLASSES = {
     "tiled_metal": G | LobeClass.TINTED,
     "scratched_metal": G,
     "tiled_blend": G | LobeClass.WHOLE | LobeClass.TINTED | LobeClass.STATED,
+    "tiled_weight": D | M | G | LobeClass.TINTED | LobeClass.PICKED,
     "tiled_normalmap": G | LobeClass.WHOLE | LobeClass.TINTED | LobeClass.STATED,
 }
 COSINES = np.array([1.0, 0.9, 0.6, 0.3, 0.1], np.float32)
@@ -194,6 +196,21 @@ def test_specular_tint_of_a_hidden_principled_is_its_base_colour(bsdfs: Material
         si.uv = mi.Point2f(0.25, v)
         tint = specular_tint(mi.BSDFPtr(bsdfs["tiled_normalmap"]), si, mi.UInt32(int(bits)), bits, mi.Bool(True))
         np.testing.assert_allclose(np.array(tint), base + 0.04, rtol=1e-5)
+
+
+def test_specular_tint_of_a_blend_is_the_share_that_is_glossy(bsdfs: Materials) -> None:
+    """To an eighth: the share is sampled."""
+    bits, metal = classify_bsdf(bsdfs["tiled_weight"]), classify_bsdf(bsdfs["roughconductor"])
+    si = seen_from(COSINES)
+    middle = mi.Point2f(0.5)
+    _, full = bsdfs["roughconductor"].sample(mi.BSDFContext(), seen_from(np.ones(1, np.float32)), 0.5, middle)
+    assert not metal & LobeClass.PICKED
+    for v in (0.25, 0.75):
+        si.uv = mi.Point2f(0.25, v)
+        tint = specular_tint(mi.BSDFPtr(bsdfs["tiled_weight"]), si, mi.UInt32(int(bits)), bits, mi.Bool(True))
+        share = 1 - reflectance(bsdfs["tiled_weight"], si)[0, 0] / BASE[0]
+        assert share == pytest.approx(0.2) or share == pytest.approx(0.8)
+        np.testing.assert_allclose(np.array(tint) / np.array(full), share, atol=1 / 16)
 
 
 def test_specular_tint_is_one_where_nothing_is_divided(bsdfs: Materials) -> None:
