@@ -22,7 +22,7 @@ RR_DEPTH = 5
 # Mitsuba's own 0.95 has infinite variance in a closed box of albedo 0.99: a bounce multiplies the mean of the squared
 # weight by albedo^2 / survival, which must stay below 1.
 RR_MAX_SURVIVAL = 0.99
-TRANSPORT_VERSION = 4  # part of the keys of what is baked; raise it whenever the estimator gives other values
+TRANSPORT_VERSION = 5  # part of the keys of what is baked; raise it whenever the estimator gives other values
 UNLIMITED_DEPTH = 0xFFFFFFFF
 
 
