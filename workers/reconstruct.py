@@ -20,7 +20,8 @@ from workers.timing import bf16_is_fast
 
 # bf16 is used only where its frame is this close to fp32's: far below what any reference can resolve.
 BF16_GATE_DB = 50.0
-PROBE_REPEATS = 3
+# Rounds in which candidates take turns; more of them while they take less than this.
+MIN_PROBE_ROUNDS, MAX_PROBE_ROUNDS, PROBE_SECONDS = 3, 15, 1.5
 MAX_SIZES = 16
 """Frame sizes whose choice is remembered; the one that was asked for longest ago is measured again."""
 MAX_COMPILED = 8
@@ -140,15 +141,14 @@ class Reconstructor:
             del candidates["fp32"]
         if len(candidates) == 1 and not self._compile:  # nothing to measure
             return next(iter(candidates.items()))
-        times = {name: _seconds(module, features) for name, module in candidates.items()}
-        best = min(times, key=lambda name: times[name])
-        module = candidates[best]
+        best = _fastest(candidates, features)
         if self._compile and self._num_compiled < MAX_COMPILED:
             self._num_compiled += 1
-            compiled = _try_compile(module, features)
-            if compiled is not None and _seconds(compiled, features) < times[best]:
-                module, best = compiled, f"{best} compiled"
-        return best, module
+            compiled = _try_compile(candidates[best], features)
+            if compiled is not None:
+                candidates = {best: candidates[best], f"{best} compiled": compiled}
+                best = _fastest(candidates, features)
+        return best, candidates[best]
 
     @cached_property
     def _bf16(self) -> FrameModule:
@@ -173,17 +173,25 @@ def channels_last(network: FusionNet) -> FusionNet:
     return network
 
 
-def _seconds(module: Any, features: Tensor) -> float:
-    """Best of a few runs after a warm-up."""
-    module(features)
-    times = []
-    for _ in range(PROBE_REPEATS):
-        start = time.perf_counter()
+def _fastest(candidates: dict[str, Any], features: Tensor) -> str:
+    """Name of the candidate with the shortest run: they take turns, so that what else runs meanwhile hits all."""
+    for module in candidates.values():
         module(features)
-        if features.is_cuda:
-            torch.cuda.synchronize()
-        times.append(time.perf_counter() - start)
-    return min(times)
+    shortest, start = dict.fromkeys(candidates, float("inf")), time.perf_counter()
+    for index in range(MAX_PROBE_ROUNDS):
+        if index >= MIN_PROBE_ROUNDS and time.perf_counter() - start > PROBE_SECONDS:
+            break
+        for name, module in candidates.items():
+            shortest[name] = min(shortest[name], _seconds(module, features))
+    return min(shortest, key=lambda name: shortest[name])
+
+
+def _seconds(module: Any, features: Tensor) -> float:
+    start = time.perf_counter()
+    module(features)
+    if features.is_cuda:
+        torch.cuda.synchronize()
+    return time.perf_counter() - start
 
 
 def _try_compile(module: Any, features: Tensor) -> Any:
