@@ -1,9 +1,8 @@
-"""Denoising of caches: neighbouring elements share light, so they share samples.
+"""Denoising of the diffuse caches: neighbouring elements share light, so they share samples.
 
-A joint-bilateral average over the nearest elements of the same shape. Place and normal decide for both lobes; the
-diffuse lobe is also guarded by its own measured variance, so that a shadow's edge is kept where it stands out of
-the noise (the range weight of non-local means with known variance, Rousselle et al. 2012, with one value for a
-patch).
+A joint-bilateral average over the nearest elements of the same shape: place and normal decide, guarded by the measured
+variance, so that a shadow's edge is kept where it stands out of the noise (the range weight of non-local means with
+known variance, Rousselle et al. 2012, with one value for a patch). `workers/directional_filter.py` is its counterpart.
 """
 
 import numpy as np
@@ -18,7 +17,6 @@ PASSES = 2
 NORMAL_POWER = 16
 RANGE_STRENGTH = 4.0
 SIGMA_SPACINGS = 1.6
-SIGMA_SPACINGS_DIRECTIONAL = 1.0
 # Differences below this share of the values are no edge, whatever the measured variance says.
 FLOOR_SHARE = 1e-6
 TINY = np.finfo(np.float64).tiny

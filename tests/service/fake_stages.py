@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from storage.caches import ArraySpec, CacheSet
+from storage.caches import ArraySpec, CacheSet, marked_units
 from storage.frames import encode_frame
 from storage.keys import unit_key
 from storage.layout import UnitRef
@@ -37,7 +37,7 @@ class FakeStages:
     """Does what the stages do to a store.
 
     Attributes:
-        folder: where it writes which unit ran in which process; one line a start.
+        folder: where it writes which units were asked for, and which ran in which process; one line a start.
         digest: of its scene; jobs of one digest share units.
         variant: of its training.
         seconds: of a unit, in `PASSES` passes.
@@ -61,6 +61,9 @@ class FakeStages:
     deaf: bool = False
 
     def __call__(self, unit: Unit, store_url: str, progress: Progress) -> Any:
+        self._note("asked", f"{unit.name},{os.getpid()},{self.variant}")
+        if self._is_stored(unit, Store.open(store_url, create=True)):  # by another job since ours looked, say
+            return unit.key
         self._note("started", f"{unit.name},{os.getpid()},{self.variant}")
         seconds = self.seconds if self.slow in ("", unit.stage) else 0.0
         with progress.track(unit.name, PASSES) as advance:
@@ -75,6 +78,12 @@ class FakeStages:
         answer = getattr(self, f"_{unit.stage}")(unit, Store.open(store_url, create=True))
         self._note("ended", unit.name)
         return answer
+
+    def _is_stored(self, unit: Unit, store: Store) -> bool:
+        if unit.stage == "bake":
+            done = marked_units(store, UnitRef(self.digest, "bake", unit.key))
+            return all(index in done for index in range(unit.first, unit.first + unit.count))
+        return bool(unit.key) and store.committed(UnitRef(self.digest, unit.stage, unit.key)) is not None
 
     def _note(self, file: str, line: str) -> None:
         with Path(self.folder, file).open("a") as log:
@@ -141,7 +150,7 @@ class FakeStages:
         return key
 
 
-def started(folder: Path) -> list[tuple[str, int, int]]:
-    """Name, process and variant of every unit that was begun."""
-    rows = (line.rsplit(",", 2) for line in (folder / "started").read_text().splitlines())
+def started(folder: Path, file: str = "started") -> list[tuple[str, int, int]]:
+    """Name, process and variant of every unit that was begun, or "asked" for."""
+    rows = (line.rsplit(",", 2) for line in (folder / file).read_text().splitlines())
     return [(name, int(pid), int(variant)) for name, pid, variant in rows]

@@ -67,10 +67,15 @@ def test_job_runs_every_unit_once_and_tells_its_progress(runner: DaskRunner, tmp
 def test_job_run_again_computes_no_stored_unit(runner: DaskRunner, tmp_path: Path, chained: bool) -> None:
     spec = fake_spec(tmp_path, digest=f"again-{chained}", chained=chained)
     Watch().run(runner, spec)
-    (tmp_path / "started").unlink()
+    (tmp_path / "asked").unlink()
     watch = Watch()
     watch.run(runner, spec)
-    assert {name.split()[0] for name, _, _ in started(tmp_path)} == {"census", "inventory", "train", "evaluate"}
+    assert {name.split()[0] for name, _, _ in started(tmp_path, "asked")} == {
+        "census",
+        "inventory",
+        "train",
+        "evaluate",
+    }
     assert [event["done"] for event in watch.of("progress") if event["stage"] == "bake diffuse"] == [20]
 
 
