@@ -98,11 +98,15 @@ class FrameRenderer:
 
     def render(self, camera: Camera) -> Frame:
         """Reconstructs the frame of a camera; any pose is answered."""
-        return make_frame(self.program, self.reconstructor, self.reconstructor.encoding.exposure, camera)
+
+        def reconstruct(features: np.ndarray) -> np.ndarray:
+            return self.reconstructor(features, lambda: self.program.run(camera))
+
+        return make_frame(self.program, reconstruct, self.reconstructor.encoding.exposure, camera)
 
     def unchecked(self, camera: Camera) -> np.ndarray:
         """Radiance as the network gives it, NaN and Inf included: for scores, which must refuse them."""
-        return self.reconstructor(self.program.run(camera))
+        return self.reconstructor(self.program.run(camera), lambda: self.program.run(camera))
 
 
 def make_frame(

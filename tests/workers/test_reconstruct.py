@@ -72,9 +72,9 @@ def test_sizes_are_remembered_up_to_a_bound_and_the_oldest_is_measured_again(mon
     measured: list[tuple[int, ...]] = []
     choose = reconstructor._choose
 
-    def counted(features: torch.Tensor) -> object:
+    def counted(features: torch.Tensor, before: object) -> object:
         measured.append(tuple(features.shape[:2]))
-        return choose(features)
+        return choose(features, before)
 
     monkeypatch.setattr(reconstructor, "_choose", counted)
     sizes = [(8 + i, 8) for i in range(MAX_SIZES)]
@@ -86,6 +86,20 @@ def test_sizes_are_remembered_up_to_a_bound_and_the_oldest_is_measured_again(mon
     assert "8x8" in reconstructor.choices and "8x9" not in reconstructor.choices, "asked for longest ago"
     np.testing.assert_array_equal(reconstructor(frame_of(*sizes[1])), frames[1])
     assert measured == [*sizes, (8, 40), sizes[1]]
+
+
+def test_candidates_are_measured_after_what_runs_before_a_frame(
+    features: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workers.reconstruct.bf16_is_fast", lambda device: True)
+    monkeypatch.setattr(Reconstructor, "_passes_gate", lambda *_: True)
+    calls: list[int] = []
+    reconstructor = Reconstructor(FusionNet(CONFIG), ENCODING, precision="auto")
+    reconstructor(features, lambda: calls.append(1))
+    assert len(calls) >= 2 * reconstruct.MIN_PROBE_ROUNDS
+    measured = len(calls)
+    reconstructor(features, lambda: calls.append(1))
+    assert len(calls) == measured, "the choice is remembered"
 
 
 def test_bf16_is_not_tried_where_the_device_does_not_compute_in_it(
