@@ -172,7 +172,11 @@ def _traced(run: RunState, spp: int, quality: str | None) -> Method:
 
 
 def _interleaved_times(run: RunState, methods: dict[str, Method]) -> dict[str, float]:
-    """Median milliseconds of each method; every round runs all of them once, so that drift hits all alike."""
+    """Median milliseconds of each method; every round times all of them once, so that drift hits all alike.
+
+    Each right after a run of its own that does not count: a round takes seconds, after which the first query and the
+    first network run took up to 7 times as long on a machine that reclaims idle memory.
+    """
     cameras = run.paths.test
     times: dict[str, list[float]] = {name: [] for name in methods}
     repeats = run.settings.evaluation.timing_repeats
@@ -180,6 +184,7 @@ def _interleaved_times(run: RunState, methods: dict[str, Method]) -> dict[str, f
         for round_ in range(repeats):
             index = round_ % len(cameras)
             for name, method in methods.items():
+                method(cameras[index], index)
                 start = time.perf_counter()
                 method(cameras[index], index)
                 times[name].append(time.perf_counter() - start)
