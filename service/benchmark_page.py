@@ -34,7 +34,8 @@ Every section names the command, commit and machine that gave it.
   the reference does not have. A frame with non-finite pixels gets no score ("refused").
 - ours: caches and network. ir: the caches alone. ir+oidn: the caches denoised, no network. pt-N: N paths a
   pixel. pt-N+oidn-Q: the same, denoised by Open Image Denoise (OIDN) at quality Q with albedo and normal.
-- Times are medians of interleaved runs after a warm-up. All rows go from a pose to a frame in memory.
+- Times are medians of interleaved runs, each right after one that does not count. All rows go from a pose to a frame
+  in memory.
 """
 
 
