@@ -20,7 +20,6 @@ SIGMA_SPACINGS = 1.6
 # Differences below this share of the values are no edge, whatever the measured variance says.
 FLOOR_SHARE = 1e-6
 TINY = np.finfo(np.float64).tiny
-FLOATS_AT_ONCE = 1 << 22  # of temporaries
 # A neighbour further than this many median spacings is no neighbour.
 MAX_SPACINGS = 3.0
 
