@@ -26,6 +26,8 @@ from workers.training_data import CropSampler, Dataset, fitted_encoding
 CHECKPOINT_SECONDS = float(os.environ.get("LIGHTWELL_CHECKPOINT_SECONDS", "60"))
 VALIDATIONS = 20
 PROBE_STEPS = 8
+REPLAN_UNTIL = 0.5
+"""Share of the steps up to which their number follows the pace: the schedule's end stays what it was meant to be."""
 
 
 class Trainer:
@@ -47,6 +49,7 @@ class Trainer:
         self.crops = CropSampler(train, self.encoding, self.settings, self.config.size_multiple, seed)
         self.loss, self.plain_loss = self._losses()
         self.step, self.num_steps, self.skipped = 0, 0, 0
+        self.spent_s, self.next_validation = 0.0, 0
         self.autocast = False
         self.curve: list[dict[str, float]] = []
         self._best: dict[str, Tensor] | None = None
@@ -81,13 +84,14 @@ class Trainer:
 
     def _resume(self) -> None:
         state = load_checkpoint(self.run, self.ref)
-        if state is None:
+        if state is None or "spent_s" not in state:  # none, or of a version that did not measure its pace
             return
         self.network.load_state_dict(state["network"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.crops.rng.bit_generator.state = state["rng"]
         torch.set_rng_state(state["torch_rng"])
         self.step, self.num_steps, self.skipped = state["step"], state["num_steps"], state["skipped"]
+        self.spent_s, self.next_validation = state["spent_s"], state["next_validation"]
         self.autocast = state["autocast"]
         self.curve, self._best = state["curve"], state["best"]
 
@@ -96,25 +100,37 @@ class Trainer:
     def fit(self) -> None:
         """Runs the remaining steps."""
         self.num_steps = self.num_steps or self._planned_steps()
-        every = max(1, self.num_steps // VALIDATIONS)
         saved = time.perf_counter()
         if self.step == 0:
             self._validate()
         with self.run.progress.track("train", self.num_steps) as advance:
-            advance(self.step)
+            shown, total = float(self.step), float(self.num_steps)
+            advance(shown)
             while self.step < self.num_steps:
-                terms = self.train_step()
-                if self.step % every == 0 or self.step == self.num_steps:
-                    self._validate()
+                share = (total - shown) / (self.num_steps - self.step)  # their number may change on the way
+                terms = self._timed_step()
                 last = self.curve[-1].get("psnr")
                 try:
-                    advance(1, f"loss {terms['total']:.4f}" + (f", validation {last:.2f} dB" if last else ""))
+                    advance(share, f"loss {terms['total']:.4f}" + (f", validation {last:.2f} dB" if last else ""))
                 except StoppedError:
                     self.save_checkpoint()
                     raise
+                shown += share
                 if time.perf_counter() - saved > CHECKPOINT_SECONDS:
                     self.save_checkpoint()
                     saved = time.perf_counter()
+
+    def _timed_step(self) -> dict[str, float]:
+        """A step, and the validation that is due after it."""
+        start = time.perf_counter()
+        terms = self.train_step()
+        is_due = self.step >= self.next_validation or self.step == self.num_steps
+        if is_due:
+            self._validate()
+        self.spent_s += time.perf_counter() - start
+        if is_due:
+            self._replan()
+        return terms
 
     def _planned_steps(self) -> int:
         """Chooses the precision and the number of steps: all epochs, fewer where the time budget ends first.
@@ -132,6 +148,12 @@ class Trainer:
         if settings.seconds <= 0:
             return full
         return int(np.clip(settings.seconds / seconds[self.autocast], 1, full))
+
+    def _replan(self) -> None:
+        """Fits the number of steps to the pace so far: a few probed steps may have met a busy or an idle moment."""
+        budget_s, full = self.settings.seconds, max(1, self.settings.epochs * self.crops.steps_per_epoch)
+        if budget_s > 0 and self.step <= REPLAN_UNTIL * self.num_steps:
+            self.num_steps = int(np.clip(budget_s * self.step / self.spent_s, self.step, full))
 
     def _probe(self, num_steps: int, autocast: bool) -> float:
         """Mean seconds of a step; leaves weights, optimizer, random state and cursor as they were."""
@@ -196,6 +218,7 @@ class Trainer:
             if point["psnr"] >= best:
                 self._best = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.curve.append(point)
+        self.next_validation = self.step + max(1, self.num_steps // VALIDATIONS)
 
     @torch.no_grad()
     def _score(self, data: Dataset, index: int) -> float:
@@ -222,6 +245,7 @@ class Trainer:
         """Commits the state of this step and drops older checkpoints."""
         state = {"network": self.network.state_dict(), "optimizer": self.optimizer.state_dict(),
                  "rng": self.crops.rng.bit_generator.state, "torch_rng": torch.get_rng_state(), "step": self.step,
-                 "num_steps": self.num_steps, "skipped": self.skipped, "autocast": self.autocast, "curve": self.curve,
+                 "num_steps": self.num_steps, "skipped": self.skipped, "spent_s": self.spent_s,
+                 "next_validation": self.next_validation, "autocast": self.autocast, "curve": self.curve,
                  "best": self._best}  # fmt: skip
         save_checkpoint(self.run, self.ref, state)

@@ -20,6 +20,7 @@ from workers.renderer import FrameRenderer, renderable_scenes
 from workers.run_state import RunState
 from workers.scene import load_scene
 from workers.settings import Settings
+from workers.timing import bf16_is_fast
 from workers.train import train_ref
 from workers.trainer import Trainer
 from workers.training_data import load_dataset
@@ -100,26 +101,54 @@ def _rebake(run, elements, ref):
     bake_units(run, elements, name, range(1))
 
 
-def test_trainer_resumes_with_the_identical_next_loss(prepared, scene, settings, tmp_path):
+def _trainer(prepared, scene, settings, overrides):
+    """A trainer on the prepared run's frames, and a function that makes another one of the same unit."""
     from workers.inputs import inputs_ref
     from workers.render import render_ref
 
     store, _ = prepared
-    run = RunState(scene, store, settings.override({"train.seconds": 0.0, "train.epochs": 2}))
+    run = RunState(scene, store, settings.override(overrides))
     elements = run_elements(run)
     inputs = [inputs_ref(run, elements, camera) for camera in run.paths.train]
     renders = [render_ref(run, camera, run.settings.frames.train_spp) for camera in run.paths.train]
     dataset = load_dataset(run, inputs, renders)
     ref = train_ref(run, inputs, renders)
-    first = Trainer(run, ref, dataset, None)
+    return Trainer(run, ref, dataset, None), lambda: Trainer(run, ref, dataset, None)
+
+
+def test_trainer_resumes_with_the_identical_next_loss(prepared, scene, settings, tmp_path):
+    first, again = _trainer(prepared, scene, settings, {"train.seconds": 0.0, "train.epochs": 2})
     first.num_steps = 10
     for _ in range(3):
         first.train_step()
     first.save_checkpoint()
     expected = [first.train_step()["total"] for _ in range(2)]
-    resumed = Trainer(run, ref, dataset, None)
+    resumed = again()
     assert resumed.step == 3
     assert [resumed.train_step()["total"] for _ in range(2)] == expected
+
+
+@pytest.mark.parametrize(("probed_s", "later_s"), [(1.0, 0.1), (0.1, 0.3)])
+def test_trainer_keeps_its_seconds_where_the_probe_was_wrong(prepared, scene, settings, monkeypatch, probed_s, later_s):
+    from workers import trainer as module
+
+    budget_s, clock = 60.0, {"now": 0.0}
+    monkeypatch.setattr(module.time, "perf_counter", lambda: clock["now"])
+    trainer, _ = _trainer(prepared, scene, settings, {"train.seconds": budget_s, "train.epochs": 1_000_000})
+    probed = module.PROBE_STEPS + 1
+    taken = []
+
+    def step() -> dict[str, float]:
+        is_probe = len(taken) < probed * (2 if bf16_is_fast(trainer.device) else 1)
+        clock["now"] += probed_s if is_probe else later_s
+        taken.append(is_probe)
+        trainer.step += 1
+        return {"total": 0.0}
+
+    monkeypatch.setattr(trainer, "train_step", step)
+    trainer.fit()
+    assert trainer.step == trainer.num_steps
+    assert trainer.step * later_s == pytest.approx(budget_s, rel=0.02)
 
 
 def test_renderer_answers_a_pose_far_outside_the_domain(prepared, scene):
