@@ -23,7 +23,7 @@ LEGEND = (
     "against ours, by its IR (marked *). Only what the cameras see is baked; the last columns are what caches on every "
     "triangle would take."
 )
-OURS = "ours"
+OURS, PLANNED, UNIFORM = "ours", "ours, planned", "uniform 64x16x32, our network"
 
 Row = Mapping[str, Any]
 
@@ -46,7 +46,8 @@ def measure_ablation(
         WorkerError: a name is no row's.
 
     Returns:
-        JSON: scene, width, height, preset, rows, command, commit, machine.
+        JSON: scene, width, height, preset, rows, command, commit, machine, and
+        whether rows were selected.
     """
     from workers.ablation import run_ablation
     from workers.evaluate import commit, machine
@@ -56,8 +57,27 @@ def measure_ablation(
     rows = run_ablation(scene, store, settings, progress, names)
     return {
         "scene": scene.name, "width": settings.width, "height": settings.height, "preset": settings.preset,
-        "rows": rows, "command": command, "commit": commit(), "machine": machine(),
+        "rows": rows, "selected": bool(names), "command": command, "commit": commit(), "machine": machine(),
     }  # fmt: skip
+
+
+def requirement(rows: Sequence[Row]) -> str:
+    """What planned caches take against uniform ones on every triangle, in a sentence; empty without both rows."""
+    by_name = {row["name"]: row for row in rows}
+    uniform, planned = by_name.get(UNIFORM), by_name.get(PLANNED)
+    if uniform is None or planned is None or uniform["psnr"] is None or planned["psnr"] is None:
+        return ""
+    return (
+        f"Planned caches against 64x16 directions x 32 paths on every triangle: {_ratio(uniform, planned, 'paths')} of "
+        f"the paths, {_ratio(uniform, planned, 'nbytes')} of the bytes, final PSNR "
+        f"{planned['psnr'] - uniform['psnr']:+.2f} dB."
+    )
+
+
+def _ratio(uniform: Row, planned: Row, cost: str) -> str:
+    """ "1/12"."""
+    taken = planned["bake_paths" if cost == "paths" else "cache_nbytes"]
+    return f"1/{uniform[f'whole_{cost}'] / taken:.3g}" if taken else "none"
 
 
 def ablation_cells(rows: Sequence[Row]) -> list[list[str]]:

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from service import scores, trade
-from service.ablations import HEAD, LEGEND, ablation_cells
+from service.ablations import HEAD, LEGEND, ablation_cells, requirement
 from service.cost_curves import HEAD as CURVES_HEAD
 from service.cost_curves import exponent_cells, exponent_head, kind_title, remarks, row_cells, sentence
 from service.scores import human_bytes, human_seconds
@@ -94,8 +94,9 @@ def _section(record: Record) -> str:
     lines += ["### Stages and sizes", "", *_stages(result)]
     lines += _frame_times(record["frame_times"])
     lines += _bake(record["bake"])
-    if "ablation" in record:
-        lines += _ablation(record)
+    for key, title in (("ablation", "Ablation"), ("selection", "Ablation, selected rows")):
+        if key in record:
+            lines += _ablation(record, record[key], title)
     return "\n".join(lines)
 
 
@@ -210,9 +211,10 @@ def _cost_curves(curves: Sequence[Record]) -> list[str]:
     return lines
 
 
-def _ablation(record: Record) -> list[str]:
-    ablation = record["ablation"]
+def _ablation(record: Record, ablation: Record, title: str) -> list[str]:
     shown = f"{ablation['width']}x{ablation['height']}, preset {ablation['preset']}. {LEGEND}"
-    lines = ["### Ablation", "", shown, "", *table(HEAD, ablation_cells(ablation["rows"]))]
+    lines = [f"### {title}", "", shown, "", *table(HEAD, ablation_cells(ablation["rows"]))]
+    said = requirement(ablation["rows"])
+    lines += [said, ""] if said else []
     same = all(ablation[key] == record[key] for key in ("command", "commit", "machine"))
     return lines if same else lines + _provenance(ablation)

@@ -127,29 +127,39 @@ def measure(
 
 
 def keep_ablation(store: "Store", digest: str, ablation: Record) -> bool:
-    """Puts an ablation beside the scene's record; False where the scene was not measured in this store."""
+    """Puts an ablation, of all rows or of a selection, beside the scene's record.
+
+    Returns:
+        False where the scene was not measured in this store.
+    """
     record = _read(store.files, record_file(ablation["scene"]))
     if record is None or record["digest"] != digest:
         return False
-    save(store.files, record | {"ablation": ablation, "measured_at": _now()})
+    key = "selection" if ablation.get("selected") else "ablation"
+    save(store.files, record | {key: ablation, "measured_at": _now()})
     return True
 
 
 def merge(previous: Record | None, record: Record) -> Record:
     """A new record with what an older one of the same scene still tells.
 
-    Kept are the ablation, and, where the settings are the same too, the seconds of stages that found their
+    Kept are its ablations, and, where the settings are the same too, the seconds of stages that found their
     work in the store this time.
     """
     if previous is None or previous["digest"] != record["digest"]:
         return record
-    kept = {"ablation": previous["ablation"]} if "ablation" in previous else {}
+    kept = _ablations(previous)
     result, old = record["result"], previous["result"]
     if old["settings"] == json_values(result["settings"]):
         known = {stage["name"]: stage for stage in old["stages"]}
         stages = list((known | {stage["name"]: stage for stage in result["stages"]}).values())
         record = record | {"result": result | {"stages": stages}}
     return kept | record
+
+
+def _ablations(record: Record) -> Record:
+    """Those of all rows and of a selection."""
+    return {key: record[key] for key in ("ablation", "selection") if key in record}
 
 
 # ------------------------------------------------- at rest -------------------------------------------------
@@ -213,8 +223,10 @@ def write_page(store: "Store", output: Path) -> int:
     beside = FileTree(output.absolute().parent)
     known = {record["scene"]: record for record in load_all(beside)}
     for record in load_all(store.files):
-        if record.get("measured_at", "") >= known.get(record["scene"], {}).get("measured_at", ""):
-            save(beside, record)
+        older = known.get(record["scene"], {})
+        if record.get("measured_at", "") >= older.get("measured_at", ""):
+            kept = _ablations(older) if older.get("digest") == record["digest"] else {}
+            save(beside, kept | record)
     copy_curves(store.files, beside)
     records = load_all(beside)
     write_file(output, render_page(records, load_curves(beside)).encode())

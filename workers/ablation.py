@@ -60,6 +60,7 @@ def variants(settings: Settings) -> list[Variant]:
         Variant("paper, 64x32 caches at equal bake time", _PAPER_CACHE | {"cache.polar": 32,
                 "cache.directional_spp": half}, network=False),
         Variant("paper, our network", _PAPER_CACHE),
+        Variant("uniform 64x16x32, our network", _PAPER_CACHE | {"cache.directional_spp": 32}),
         Variant("ours, no demodulation", {"cache.demodulate": False}),
         Variant("ours, blocks of 4x4 pixels", {"train.unshuffle": 4, "train.widths": (48, 64, 96)}),
         Variant("ours, concatenation", {"train.fusion": "concatenate"}),

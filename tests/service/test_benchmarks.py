@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from service import trade
-from service.ablations import HEAD, ablation_cells
+from service.ablations import HEAD, OURS, PLANNED, UNIFORM, ablation_cells, requirement
 from service.benchmark_page import render_page, table
 from service.benchmarks import (
     BenchmarkError,
@@ -27,6 +27,7 @@ from service.benchmarks import (
 )
 from service.cli import app
 from storage.store import Store
+from workers.ablation import variants
 from workers.camera import Camera
 from workers.progress import Progress
 from workers.settings import Settings
@@ -291,6 +292,39 @@ def test_page_shows_the_ablation_with_its_own_command() -> None:
     assert "| paper, 1 ray | 23.00 | - | -6.00* | 0.9000* | 0.1000* | 2.5 M | 12.0 s | 2.0 KiB |" in ablation
     same = own | {key: make_record()[key] for key in ("command", "commit", "machine")}
     assert "```sh" not in section(render_page([make_record(ablation=same)]), "Ablation")
+
+
+def whole_row(name: str, psnr: float, paths: float, whole: float) -> dict[str, Any]:
+    costs = {"bake_paths": paths, "cache_nbytes": paths / 10, "whole_paths": whole, "whole_nbytes": whole / 20}
+    return ablation_row(name, 20.0, psnr) | costs
+
+
+def test_page_says_what_a_plan_saves_against_uniform_caches_on_every_triangle() -> None:
+    names = {row.name for row in variants(Settings.preset_named("tiny"))}
+    assert {OURS, PLANNED, UNIFORM} <= names
+    rows = [whole_row(UNIFORM, 30.0, 5e8, 1e9), whole_row(PLANNED, 32.5, 4e7, 4e7)]
+    said = "1/25 of the paths, 1/12.5 of the bytes, final PSNR +2.50 dB."
+    own = {"command": "b", "commit": "fff", "machine": "other", "width": 64, "height": 64, "preset": "tiny"}
+    page = render_page([make_record(ablation=own | {"rows": ABLATION_ROWS}, selection=own | {"rows": rows})])
+    assert said in section(page, "Ablation, selected rows")
+    assert "every triangle: 1/" not in section(page, "Ablation")
+    assert requirement(rows[:1]) == "" and requirement([rows[0] | {"psnr": None}, rows[1]]) == ""
+
+
+def test_selected_rows_do_not_replace_an_ablation_of_all(tmp_path: Path) -> None:
+    store = Store.open(tmp_path / "store", create=True)
+    page = tmp_path / "docs" / "page.md"
+    whole, some = ({"scene": "hall", "command": name, "commit": "fff", "machine": "m", "width": 64, "height": 64,
+                    "preset": "tiny", "rows": ABLATION_ROWS} for name in ("whole", "some"))  # fmt: skip
+    save(store.files, make_record())
+    keep_ablation(store, "d1", whole)
+    keep_ablation(store, "d1", some | {"selected": True})
+    write_page(store, page)
+    assert [load_all(store.files)[0][key]["command"] for key in ("ablation", "selection")] == ["whole", "some"]
+    another = Store.open(tmp_path / "another", create=True)
+    save(another.files, make_record(measured_at="9999"))
+    write_page(another, page)  # measured again in a store that knows no ablation
+    assert "whole" in section(page.read_text(), "Ablation")
 
 
 def test_table_cells_cannot_break_the_table() -> None:
