@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from service import scores, trade
+from service import scores, trade, tradeoff
 from service.ablations import HEAD, LEGEND, ablation_cells, requirement
 from service.cost_curves import HEAD as CURVES_HEAD
 from service.cost_curves import exponent_cells, exponent_head, kind_title, remarks, row_cells, sentence
@@ -39,14 +39,14 @@ Every section names the command, commit and machine that gave it.
 """
 
 
-def render_page(records: Sequence[Record], curves: Sequence[Record] = ()) -> str:
-    """The whole page: scenes, then cost curves."""
-    if not records and not curves:
+def render_page(records: Sequence[Record], curves: Sequence[Record] = (), trades: Sequence[Record] = ()) -> str:
+    """The whole page: scenes, then tradeoffs and cost curves."""
+    if not records and not curves and not trades:
         return f"{INTRODUCTION}\nNo scene has been measured yet.\n"
     lines = [INTRODUCTION]
     if records:
         lines += [*_summary(records), *(_section(record) for record in records)]
-    return "\n".join([*lines, *_cost_curves(curves)])
+    return "\n".join([*lines, *_trades(trades), *_cost_curves(curves)])
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
@@ -189,6 +189,21 @@ def _bake(bake: Mapping[str, Any]) -> list[str]:
            "diffuse cache." if "diffuse-traced" in rates else ""), "",
         *table(("paths from", "M paths/s", "ratio", "paths a launch"), rows),
     ]  # fmt: skip
+
+
+def _trades(trades: Sequence[Record]) -> list[str]:
+    if not trades:
+        return []
+    lines = ["## Tradeoffs", "", f"Fastest first. {tradeoff.LEGEND}", ""]
+    for record in trades:
+        result, scene = record["result"], record["scene"]
+        lines += [f"### {scene}: tradeoff", ""]
+        lines += [f"{result['width']}x{result['height']}, preset {result['preset']}. {tradeoff.dominance(result)}", ""]
+        lines += ["```sh", record["command"], "```", "", f"Commit {result['commit']}.", ""]
+        lines += table(tradeoff.HEAD, (tradeoff.tradeoff_cells(row) for row in tradeoff.by_time(result["rows"])))
+        lines += [f"![{scene}: error against time, bake and bytes]({tradeoff.TRADES.folder}/{scene}.png)", ""]
+        lines += [*(f"- {_cell(remark.removeprefix('note: '))}" for remark in tradeoff.remarks(result)), ""]
+    return lines
 
 
 def _cost_curves(curves: Sequence[Record]) -> list[str]:

@@ -18,10 +18,12 @@ from typing import TYPE_CHECKING, Any
 
 from service.ablations import measure_ablation
 from service.benchmark_page import render_page
-from service.cost_curves import copy_curves, load_curves
+from service.cost_curves import CURVES
 from service.errors import ServiceError
 from service.options import write_file
 from service.outcome import json_values
+from service.tradeoff import TRADES
+from service.tradeoff_plot import tradeoff_plot
 
 if TYPE_CHECKING:
     from storage.durable import FileTree
@@ -227,7 +229,9 @@ def write_page(store: "Store", output: Path) -> int:
         if record.get("measured_at", "") >= older.get("measured_at", ""):
             kept = _ablations(older) if older.get("digest") == record["digest"] else {}
             save(beside, kept | record)
-    copy_curves(store.files, beside)
+    CURVES.copy(store.files, beside)
+    for record in TRADES.copy(store.files, beside):
+        beside.write(f"{TRADES.folder}/{record['scene']}.png", tradeoff_plot(record["result"], ".png"))
     records = load_all(beside)
-    write_file(output, render_page(records, load_curves(beside)).encode())
+    write_file(output, render_page(records, CURVES.load(beside), TRADES.load(beside)).encode())
     return len(records)

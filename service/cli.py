@@ -235,7 +235,8 @@ def tradeoff(
     """
     with reported():
         outputs = Outputs(json=json_file)
-        from service.tradeoff import tradeoff_table, write_tradeoff
+        from service.benchmarks import shown_command, shown_path
+        from service.tradeoff import TRADES, tradeoff_table, write_tradeoff
         from service.tradeoff_plot import plot_suffix
 
         if plot_file is not None:
@@ -252,8 +253,19 @@ def tradeoff(
             budget = dataclasses.replace(budget, sizes=tuple(map(parse_size, sizes)))
         loaded = _load(scene, resolution)
         settings = _settings(preset, loaded, assignments)
+        opened = Store.open(store, create=True)
         with RichProgress() as progress:
-            table = run_tradeoff(loaded, Store.open(store, create=True), settings, progress, budget)
+            table = run_tradeoff(loaded, opened, settings, progress, budget)
+        rest = [
+            "--network-seconds",
+            f"{network_seconds:g}",
+            "--repeats",
+            str(repeats),
+            *([] if paper else ["--no-paper"]),
+        ]
+        rest += [word for size in sizes or [] for word in ("--size", size)]
+        command = shown_command(["tradeoff", shown_path(scene)], store, preset, resolution, assignments or [], rest)
+        TRADES.keep(opened.files, table.result, command)
         show(tradeoff_table(table.result))
         write_tradeoff(table.to_json(), outputs.json, plot_file)
 

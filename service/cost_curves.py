@@ -1,39 +1,23 @@
-"""Cost curves as people read them: a terminal table, the benchmarks page's section, and their records in the store.
+"""Cost curves as people read them: a terminal table and the benchmarks page's section."""
 
-<store>/cost-curves/<scene>.json, and docs/cost-curves/<scene>.json beside the page
-"""
-
-import json
-import time
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Group, RenderableType
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from service.errors import ServiceError
-from service.outcome import json_values
+from service.page_records import PageRecords
 from service.scores import ABSENT, human_bytes, human_seconds
 
-if TYPE_CHECKING:
-    from storage.durable import FileTree
-
-FOLDER = "cost-curves"
-SCHEMA = 1
+CURVES = PageRecords("cost-curves", "cost curves")
 KIND_TITLES = {"lattice": "ours, budget fixed", "triangle": "paper, an element a triangle"}
 HEAD = ("triangles", "made by", "elements", "elements stage", "bake paths", "bake", "at rest", "in memory", "query, ms")
 QUANTITY_TITLES = {
     "elements": "elements", "elements_seconds": "elements stage, s", "bake_paths": "bake, paths",
     "bake_seconds": "bake, s", "nbytes": "at rest, bytes", "memory_nbytes": "in memory, bytes", "query_ms": "query, ms",
 }  # fmt: skip
-
-Record = dict[str, Any]
-
-
-class CostCurvesError(ServiceError, ValueError):
-    """A record of cost curves cannot be read."""
 
 
 def kind_title(kind: str) -> str:
@@ -115,52 +99,3 @@ def remarks(result: Mapping[str, Any]) -> list[str]:
         f"rounds; other processes kept {load['other_cpus']:.1f} of {load['cpus']:.0f} CPUs busy",
         *(f"note: {note}" for note in result["notes"]),
     ]
-
-
-# -------------------------------------------------- at rest --------------------------------------------------
-
-
-def keep_curves(files: "FileTree", result: Mapping[str, Any], command: str) -> Record:
-    """Keeps a scene's curves in place of older ones; returns the record."""
-    record = {"schema": SCHEMA, "scene": result["scene"], "command": command, "result": json_values(dict(result)),
-              "measured_at": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())}  # fmt: skip
-    _write(files, record)
-    return record
-
-
-def load_curves(files: "FileTree") -> list[Record]:
-    """Every record, by scene name.
-
-    Raises:
-        CostCurvesError: one cannot be read.
-    """
-    names = [name for name in files.names(FOLDER) if name.endswith(".json") and not name.startswith(".")]
-    records = [_read(files, f"{FOLDER}/{name}") for name in names]
-    return sorted(records, key=lambda record: str(record["scene"]))
-
-
-def copy_curves(source: "FileTree", target: "FileTree") -> None:
-    """Copies the records that `target` lacks or has from an earlier time."""
-    known = {record["scene"]: record for record in load_curves(target)}
-    for record in load_curves(source):
-        if record.get("measured_at", "") >= known.get(record["scene"], {}).get("measured_at", ""):
-            _write(target, record)
-
-
-def _write(files: "FileTree", record: Record) -> None:
-    text = json.dumps(record, indent=2, allow_nan=False)
-    files.write(f"{FOLDER}/{record['scene']}.json", f"{text}\n".encode())
-
-
-def _read(files: "FileTree", file: str) -> Record:
-    try:
-        record = json.loads(files.read(file) or b"")
-        if record["schema"] != SCHEMA:
-            raise ValueError(f"schema {record['schema']}")
-    except (ValueError, KeyError, TypeError) as error:
-        raise CostCurvesError(
-            f"cost curves must be JSON of schema {SCHEMA}, got {error} in {files.path(file)}; "
-            "delete it and measure the scene again"
-        ) from error
-    found: Record = record
-    return found

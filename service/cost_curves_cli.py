@@ -62,7 +62,7 @@ def cost_curves(
             plot_suffix(plot_file)
             check_writable(plot_file, "--plot")
         from service.benchmarks import json_bytes, shown_path
-        from service.cost_curves import cost_curves_table, keep_curves
+        from service.cost_curves import CURVES, cost_curves_table
         from service.cost_curves_plot import cost_curves_plot
         from service.progress import RichProgress
         from service.table import show
@@ -86,7 +86,7 @@ def cost_curves(
         show(cost_curves_table(result))
         if opened is not None:
             command = ["cost-curves", shown_path(scene), "--triangles", triangles, "--preset", preset]
-            keep_curves(opened.files, result, _shown(command, store or "", resolution, assignments, size, repeats))
+            CURVES.keep(opened.files, result, _shown(command, store or "", resolution, assignments, size, repeats))
         if outputs.json is not None:
             write_file(outputs.json, json_bytes(result))
         if plot_file is not None:

@@ -12,6 +12,7 @@ from rich.text import Text
 
 from service.options import write_file
 from service.outcome import json_values
+from service.page_records import PageRecords
 from service.scores import ABSENT, REFUSED, human_bytes, human_seconds, method_title
 
 HEAD = ("frame", "PSNR dB ↑", "FLIP ↓", "temporal ↓", "ms ↓", "bake", "bytes", "training", "front", "beaten by")
@@ -19,6 +20,9 @@ LEGEND = (
     "front: no other row is better in both PSNR and what it costs (t time a frame, b bake seconds, s bytes). "
     "beaten by: one of ours that takes no more time and is no worse in PSNR and FLIP."
 )
+TRADES = PageRecords("tradeoffs", "tradeoffs")
+MAX_SPP = 8
+"""Path-traced rows up to here are what a front has to beat (`dominance`)."""
 _MARKS = {"ms": "t", "bake_seconds": "b", "nbytes": "s"}
 
 Row = Mapping[str, Any]
@@ -48,11 +52,12 @@ def tradeoff_table(result: Mapping[str, Any]) -> RenderableType:
         table.add_column(name, justify="right" if 0 < index < len(HEAD) - 2 else "left", no_wrap=True)
     for row in by_time(result["rows"]):
         style = "bold cyan" if row["kind"] == "ours" else ""
-        table.add_row(*(Text(cell, style=style) for cell in _cells(row)))
+        table.add_row(*(Text(cell, style=style) for cell in tradeoff_cells(row)))
     return Group(table, *(Text(line, style="dim") for line in remarks(result)))
 
 
-def _cells(row: Row) -> list[str]:
+def tradeoff_cells(row: Row) -> list[str]:
+    """A row's texts, in the order of `HEAD`."""
     scores = [
         REFUSED if row.get("non_finite") else ABSENT if row[key] is None else pattern.format(row[key])
         for key, pattern in (("psnr", "{:.2f}"), ("flip", "{:.4f}"), ("temporal", "{:.4f}"))
@@ -63,6 +68,20 @@ def _cells(row: Row) -> list[str]:
     ]
     front = "".join(mark for cost, mark in _MARKS.items() if "psnr" in row["pareto"][cost])
     return [tradeoff_title(row), *scores, f"{row['ms']:.1f}", *costs, front, row.get("beaten_by") or ""]
+
+
+def dominance(result: Mapping[str, Any]) -> str:
+    """Whether ours beat path tracing with Open Image Denoise of few samples, in a sentence."""
+    rows = [row for row in result["rows"] if row["kind"] == "path tracing" and "+oidn" in row["name"]
+            and int(row["name"].split("+")[0].removeprefix("pt-")) <= MAX_SPP]  # fmt: skip
+    unbeaten = [row["name"] for row in rows if not row["beaten_by"]]
+    what = f"the {len(rows)} denoised path-traced rows up to {MAX_SPP} spp"
+    if not rows:
+        return ""
+    beaten = "one of ours that takes no more time and is no worse in PSNR and FLIP"
+    return f"Of {what}, {len(rows) - len(unbeaten)} are beaten by {beaten}" + (
+        f"; not beaten: {', '.join(unbeaten)}." if unbeaten else "."
+    )
 
 
 def remarks(result: Mapping[str, Any]) -> list[str]:

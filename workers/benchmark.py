@@ -118,7 +118,7 @@ def frame_times(
         "primary": lambda index: primary.cast(local),
         "query-1x1": lambda index: single.run(camera),
         "query": lambda index: renderer.program.run(camera),
-        "network": lambda index: renderer.reconstructor(features),
+        "network": lambda index: renderer.reconstructor(features, lambda: renderer.program.run(camera)),
         "frame": lambda index: renderer.render(camera),
         "pt-1": lambda index: trace(scene, camera, 1, index),
     }

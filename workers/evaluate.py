@@ -2,7 +2,6 @@
 
 import platform
 import subprocess
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +23,7 @@ from workers.query import CHANNELS
 from workers.render import load_render
 from workers.renderer import FrameRenderer
 from workers.run_state import RunState
+from workers.timing import interleaved_medians
 
 REFERENCE_MARGIN_DB = 3.0
 PICTURE_METHODS = ("ir", "ours", "pt-1+oidn-high", "pt-4+oidn-high")
@@ -80,14 +80,18 @@ def run_evaluation(
             for index, camera in enumerate(cameras):
                 frames[name].append(method(camera, index))
                 advance(note=name)
-    milliseconds = _interleaved_times(run, methods)
+    timed: dict[str, Callable[[int], object]] = {
+        name: lambda index, method=method: method(cameras[index % len(cameras)], index)  # type: ignore[misc]
+        for name, method in methods.items()
+    }
+    medians = interleaved_medians(timed, run.settings.evaluation.timing_repeats, run.progress, "time")
     positions = [positions_of(renderer, camera) for camera in cameras]
     near_cameras = [run.scene.frame.near_camera(camera) for camera in cameras]
     rows = []
     with run.progress.track("score", len(methods)) as advance:
         for name in methods:
             shared = (reference.frames, exposure, perceptual, near_cameras, positions)
-            rows.append(score_row(name, frames[name], *shared, milliseconds[name]))
+            rows.append(score_row(name, frames[name], *shared, 1e3 * medians[name]))
             advance(note=name)
     coverage = float(np.mean([renderer.render(camera).coverage for camera in cameras]))
     notes = [*run.scene.notes, *run.paths.notes]
@@ -169,27 +173,6 @@ def _traced(run: RunState, spp: int, quality: str | None) -> Method:
         return denoise(image.radiance, image.albedo, image.normal, quality=quality)
 
     return method
-
-
-def _interleaved_times(run: RunState, methods: dict[str, Method]) -> dict[str, float]:
-    """Median milliseconds of each method; every round times all of them once, so that drift hits all alike.
-
-    Each right after a run of its own that does not count: a round takes seconds, after which the first query and the
-    first network run took up to 7 times as long on a machine that reclaims idle memory.
-    """
-    cameras = run.paths.test
-    times: dict[str, list[float]] = {name: [] for name in methods}
-    repeats = run.settings.evaluation.timing_repeats
-    with run.progress.track("time", repeats) as advance:
-        for round_ in range(repeats):
-            index = round_ % len(cameras)
-            for name, method in methods.items():
-                method(cameras[index], index)
-                start = time.perf_counter()
-                method(cameras[index], index)
-                times[name].append(time.perf_counter() - start)
-            advance()
-    return {name: float(np.median(values)) * 1e3 for name, values in times.items()}
 
 
 def positions_of(renderer: FrameRenderer, camera: Camera) -> np.ndarray:

@@ -98,15 +98,15 @@ class FrameRenderer:
 
     def render(self, camera: Camera) -> Frame:
         """Reconstructs the frame of a camera; any pose is answered."""
-
-        def reconstruct(features: np.ndarray) -> np.ndarray:
-            return self.reconstructor(features, lambda: self.program.run(camera))
-
-        return make_frame(self.program, reconstruct, self.reconstructor.encoding.exposure, camera)
+        return make_frame(self.program, self._network(camera), self.reconstructor.encoding.exposure, camera)
 
     def unchecked(self, camera: Camera) -> np.ndarray:
         """Radiance as the network gives it, NaN and Inf included: for scores, which must refuse them."""
-        return self.reconstructor(self.program.run(camera), lambda: self.program.run(camera))
+        return self._network(camera)(self.program.run(camera))
+
+    def _network(self, camera: Camera) -> Callable[[np.ndarray], np.ndarray]:
+        """Features to radiance; what is fastest for a new size is measured after queries of this camera."""
+        return lambda features: self.reconstructor(features, lambda: self.program.run(camera))
 
 
 def make_frame(

@@ -1,7 +1,9 @@
 """Wall times that may be compared, and what the machine can compute at most.
 
-Methods that are compared are timed interleaved: each round runs every one once, so that a slow phase of the
-machine hits all alike, and medians count. A first round, not counted, compiles and warms up.
+Methods that are compared are timed interleaved: each round times every one once, so that a slow phase of the
+machine hits all alike, and medians count. Each is timed right after a run of its own that does not count: a round takes
+seconds, after which the first query and the first network run took up to 7 times as long on a machine that reclaims
+idle memory.
 """
 
 import time
@@ -33,24 +35,22 @@ def interleaved_medians(
 def interleaved_seconds(
     methods: dict[str, Callable[[int], object]], repeats: int, progress: Progress, description: str
 ) -> dict[str, list[float]]:
-    """Wall seconds of each method in every counted round.
+    """Wall seconds of each method in every round.
 
     Args:
-        methods: name to function of the round's index (0 is the round that is not counted); each must return
-            only when its work is done.
-        repeats: counted rounds, at least 1.
+        methods: name to function of the round's index, from 0 on; each must return only when its work is done.
+        repeats: rounds, at least 1.
         progress: told round by round.
         description: for the progress.
     """
     times: dict[str, list[float]] = {name: [] for name in methods}
-    with progress.track(description, repeats + 1) as advance:
-        for index in range(repeats + 1):
+    with progress.track(description, repeats) as advance:
+        for index in range(repeats):
             for name, method in methods.items():
+                method(index)
                 start = time.perf_counter()
                 method(index)
-                seconds = time.perf_counter() - start
-                if index:
-                    times[name].append(seconds)
+                times[name].append(time.perf_counter() - start)
             advance()
     return times
 

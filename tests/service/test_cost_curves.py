@@ -12,18 +12,11 @@ import workers.cost_curves
 from service.benchmark_page import render_page
 from service.benchmarks import write_page
 from service.cli import app
-from service.cost_curves import (
-    FOLDER,
-    CostCurvesError,
-    cost_curves_table,
-    exponent_cells,
-    keep_curves,
-    load_curves,
-    sentence,
-)
+from service.cost_curves import CURVES, cost_curves_table, exponent_cells, sentence
 from service.cost_curves_cli import parse_counts
 from service.cost_curves_plot import cost_curves_plot
 from service.errors import OptionError
+from service.page_records import RecordError
 from storage.store import Store
 from workers.cost_curves import fitted
 
@@ -71,8 +64,8 @@ def test_table_shows_rows_exponents_and_notes(result: dict[str, Any]) -> None:
 
 def test_record_returns_as_it_went_and_stands_on_the_page(result: dict[str, Any], tmp_path: Path) -> None:
     store = Store.open(tmp_path / "store", create=True)
-    keep_curves(store.files, result, "lightwell cost-curves hall")
-    (record,) = load_curves(store.files)
+    CURVES.keep(store.files, result, "lightwell cost-curves hall")
+    (record,) = CURVES.load(store.files)
     assert record["result"] == json.loads(json.dumps(result))
     assert store.verify() == []
     assert write_page(store, tmp_path / "page.md") == 0
@@ -91,9 +84,9 @@ def test_page_without_curves_has_no_such_section() -> None:
 @pytest.mark.parametrize("data", [b"", b"{", b"[]", b'{"schema": 9}'])
 def test_record_that_is_not_ours_is_named(data: bytes, tmp_path: Path) -> None:
     store = Store.open(tmp_path / "store", create=True)
-    store.files.write(f"{FOLDER}/hall.json", data)
-    with pytest.raises(CostCurvesError, match=r"hall\.json"):
-        load_curves(store.files)
+    store.files.write(f"{CURVES.folder}/hall.json", data)
+    with pytest.raises(RecordError, match=r"hall\.json"):
+        CURVES.load(store.files)
 
 
 @pytest.mark.parametrize(("suffix", "start"), [(".png", b"\x89PNG"), (".svg", b"<?xml")])
@@ -128,7 +121,7 @@ def test_command_measures_keeps_and_writes(
     assert budget.triangles == (100, 200) and dict(budget.overrides) == {"cache.polar": "3"}
     assert json.loads(files["json"].read_text())["scene"] == "hall"
     assert files["png"].read_bytes().startswith(b"\x89PNG")
-    (record,) = load_curves(Store.open(tmp_path / "store").files)
+    (record,) = CURVES.load(Store.open(tmp_path / "store").files)
     assert "--triangles 100,200" in record["command"] and str(tmp_path.parent) not in record["command"]
 
 

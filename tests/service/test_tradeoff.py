@@ -14,12 +14,13 @@ from PIL import Image
 from rich.console import Console
 from typer.testing import CliRunner
 
+from service.benchmarks import write_page
 from service.cli import app as command
 from service.errors import OptionError, UnknownSceneError
 from service.frame_choice import Demand, choose_point, point_headers
 from service.problems import add_problem_handlers
 from service.routes_tradeoff import add_tradeoff_routes, store_tables
-from service.tradeoff import tradeoff_table, write_tradeoff
+from service.tradeoff import TRADES, dominance, tradeoff_table, write_tradeoff
 from service.tradeoff_plot import plot_suffix, tradeoff_plot
 from storage.store import Store
 from workers.errors import NoOperatingPointsError, UnreachableTargetError
@@ -56,7 +57,7 @@ def make_table() -> OperatingTable:
     )  # fmt: skip
     result = {"scene": "hall", "width": 100, "height": 100, "preset": "draft", "rows": rows, "machine": "two cores",
               "repeats": 3, "num_frames": 6, "reference_error_db": 44.0, "notes": ["trained briefly"],
-              "load": {"other_cpus": 0.2, "cpus": 2.0}}  # fmt: skip
+              "commit": "0123abc", "load": {"other_cpus": 0.2, "cpus": 2.0}}  # fmt: skip
     return OperatingTable(base={}, points=points, result=result)
 
 
@@ -98,6 +99,30 @@ def test_table_tells_every_row_front_and_note() -> None:
     assert "refused" in lines["path tracing 1 spp"]
     assert lines["path tracing 1 spp + OIDN fast"].rstrip("│ ").endswith("ours")
     assert "note: trained briefly" in text and "44.00 dB" in text
+
+
+def test_dominance_counts_denoised_rows_of_few_samples() -> None:
+    result = make_table().result
+    said = "Of the 2 denoised path-traced rows up to 8 spp, 1 are beaten by one of ours"
+    assert dominance(result).startswith(said) and dominance(result).endswith("not beaten: pt-8+oidn-high.")
+    few = result | {"rows": [r for r in result["rows"] if "pt-8" not in r["name"]]}
+    assert dominance(few).endswith("no worse in PSNR and FLIP.")
+    assert dominance(result | {"rows": []}) == ""
+
+
+def test_a_kept_tradeoff_stands_on_the_page_with_its_plot(store: Store, tmp_path: Path) -> None:
+    result, page = make_table().result, tmp_path / "docs" / "page.md"
+    TRADES.keep(store.files, result, "lightwell tradeoff hall")
+    write_page(store, page)
+    text = page.read_text()
+    assert dominance(result) in text and "lightwell tradeoff hall" in text and "Commit 0123abc." in text
+    assert text.index("| ours, no network | 29.00") < text.index("| path tracing 1 spp + OIDN fast | 31.00")
+    with Image.open(page.parent / "tradeoffs" / "hall.png") as picture:
+        assert picture.size[0] > 1000
+    assert "(tradeoffs/hall.png)" in text
+    other = Store.open(tmp_path / "other", create=True)
+    assert write_page(other, page) == 0
+    assert page.read_text() == text, "a store without it leaves it"
 
 
 @pytest.mark.parametrize(("suffix", "magic"), [(".pdf", b"%PDF"), (".svg", b"<?xml")])
