@@ -53,7 +53,7 @@ def measure_ablation(
     from workers.evaluate import commit, machine
 
     if all(entry["digest"] != scene.digest for entry in store.scenes()):
-        store.register_scene(scene.digest, {"name": scene.name, "source": str(scene.source)})
+        store.register_scene(scene.digest, {"name": scene.name, "source": scene.address})
     rows = run_ablation(scene, store, settings, progress, names)
     return {
         "scene": scene.name, "width": settings.width, "height": settings.height, "preset": settings.preset,

@@ -9,6 +9,7 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fastapi import FastAPI
@@ -19,7 +20,7 @@ from service.bundle_rules import SceneLimits
 from service.bundles import BundleStore
 from service.config import ServiceConfig
 from service.failures import known_errors, one_line
-from service.metrics import FrameMetrics, job_metrics
+from service.metrics import Counts, FrameMetrics, job_metrics
 from service.pictures import DEFAULT_QUEUE_LIMIT, DEFAULT_RECENT_NBYTES, Pictures
 from service.problems import add_problem_handlers
 from service.redaction import register_secrets
@@ -33,6 +34,8 @@ from service.scene_cache import DEFAULT_MEMORY_NBYTES
 from service.schemas import DEFAULT_MAX_PIXELS
 from service.serving import is_loopback
 from service.version import package_version
+from storage.errors import StoreNotFoundError
+from storage.store import Store
 
 if TYPE_CHECKING:
     from service.jobs.service import Jobs
@@ -74,7 +77,9 @@ def create_app(
     if config is not None:
         max_pixels, queue_limit, memory_nbytes = config.max_pixels, config.queue_limit, config.memory_limit
     rendering = RenderThread(
-        make_backend or (lambda: StoreBackend(store_url)), budget_nbytes=memory_nbytes, preload=preload
+        make_backend or (lambda: StoreBackend(store_url, compile=config is not None and config.compile)),
+        budget_nbytes=memory_nbytes,
+        preload=preload,
     )
     metrics, readiness = FrameMetrics(), Readiness()
     pictures = Pictures(rendering, metrics, queue_limit=queue_limit, recent_nbytes=recent_nbytes)
@@ -113,12 +118,23 @@ def create_app(
     if jobs is not None:
         from service.routes_jobs import add_job_routes
 
-        add_job_routes(app, jobs)
-        job_metrics(metrics.registry, lambda: {state.value: n for state, n in jobs.table.counts().items()})
+        add_job_routes(app, jobs, store_url)
+        _show_jobs(metrics, jobs)
     if config is not None:
-        _add_configured(app, config, jobs)
+        _add_configured(app, config, jobs, store_url)
     add_tradeoff_routes(app, rendering.catalogue.resolve, store_tables(store_url))
     return app
+
+
+def _show_jobs(metrics: FrameMetrics, jobs: "Jobs") -> None:
+    totals = jobs.unit_totals
+    by_stage: dict[str, Counts] = {} if totals is None else {
+        "units_by_stage": lambda: dict(totals.units), "seconds_by_stage": lambda: dict(totals.seconds),
+        "set_aside_by_stage": lambda: dict(totals.set_aside),
+    }  # fmt: skip
+    job_metrics(
+        metrics.registry, lambda: {state.value: n for state, n in jobs.table.counts().items()}, **by_stage
+    )  # fmt: skip
 
 
 async def _warm_up(rendering: RenderThread, readiness: Readiness) -> None:
@@ -135,11 +151,24 @@ async def _warm_up(rendering: RenderThread, readiness: Readiness) -> None:
         readiness.ready()
 
 
-def _add_configured(app: FastAPI, config: ServiceConfig, jobs: "Jobs | None") -> None:
+def _is_served(store_url: str, folder: Path) -> bool:
+    """Whether a scene of the store lies in the folder: opening it reads its files again."""
+    try:
+        entries = Store.open(store_url).scenes()
+    except StoreNotFoundError:
+        return False
+    return any(Path(str(entry.get("source", ""))).is_relative_to(folder) for entry in entries)
+
+
+def _add_configured(app: FastAPI, config: ServiceConfig, jobs: "Jobs | None", store_url: str) -> None:
     """Bundles, then what stands before every route: limits, and outermost who may ask."""
     register_secrets(config.secrets())
-    in_use = (lambda bundle_id: jobs.uses(bundle_id)) if jobs is not None else (lambda bundle_id: False)
-    add_bundle_routes(app, bundle_store(config), config.upload_max_nbytes, in_use)
+    bundles = bundle_store(config)
+
+    def in_use(bundle_id: str) -> bool:
+        return (jobs is not None and jobs.uses(bundle_id)) or _is_served(store_url, bundles.folder / bundle_id)
+
+    add_bundle_routes(app, bundles, config.upload_max_nbytes, in_use)
     add_body_limit(
         app, config.body_max_nbytes, {UPLOAD_PATH: config.upload_max_nbytes + FORM_OVERHEAD_NBYTES}
     )  # fmt: skip

@@ -51,9 +51,12 @@ BENCHMARKS_PAGE = Path("docs/benchmarks.md")
 
 def _load(scene: str, resolution: str | None) -> "Scene":
     width, height = parse_size(resolution, "--resolution") if resolution else (None, None)
-    from workers.scene import load_scene
+    from service.progress import RichProgress
 
-    return load_scene(scene, width=width, height=height)
+    with RichProgress() as progress, progress.busy(f"load {scene}"):
+        from workers.scene import load_scene
+
+        return load_scene(scene, width=width, height=height)
 
 
 def _settings(preset: str, scene: "Scene", assignments: list[str] | None) -> "Settings":
@@ -117,10 +120,12 @@ def plan(
         settings = _settings(preset, loaded, assignments)
         from service.benchmarks import json_bytes
         from service.options import write_file
+        from service.progress import RichProgress
         from service.table import plan_table, show
         from workers.pipeline import plan_scene
 
-        made = plan_scene(loaded, settings)
+        with RichProgress() as progress, progress.busy("audit, pilot bake and calibration"):
+            made = plan_scene(loaded, settings)
         show(plan_table(made))
         if outputs.json is not None:
             write_file(outputs.json, json_bytes(made))
@@ -154,23 +159,35 @@ def run(
 def evaluate(
     scene: SceneArgument,
     store: StoreOption,
-    preset: PresetOption = "balanced",
+    preset: Annotated[
+        str | None,
+        typer.Option("--preset", help="of the run to measure; default: the one that the scene is served from"),
+    ] = None,
     resolution: ResolutionOption = None,
     assignments: SetOption = None,
     json_file: JsonOption = None,
     report: ReportOption = None,
     picture: PictureOption = None,
 ) -> None:
-    """Measure again what an earlier run with the same preset, resolution and settings made."""
+    """Measure again what an earlier run made: with its own settings where no preset is given.
+
+    `--set evaluation.spp=64` and the like change what it is compared to.
+    """
     with reported():
         outputs = Outputs(json=json_file, report=report, picture=picture)
         from service.progress import RichProgress
         from storage.store import Store
-        from workers.pipeline import evaluate_scene
+        from workers.pipeline import evaluate_scene, published_settings
 
         opened = Store.open(store)
         loaded = _load(scene, resolution)
-        settings = _settings(preset, loaded, assignments)
+        if preset is None:
+            settings = published_settings(loaded, opened).override(parse_overrides(assignments or []))
+            if resolution is None:
+                loaded = _load(scene, f"{settings.width}x{settings.height}")
+            settings = settings.override({"width": loaded.camera.width, "height": loaded.camera.height})
+        else:
+            settings = _settings(preset, loaded, assignments)
         with RichProgress() as progress:
             evaluation = evaluate_scene(loaded, opened, settings, progress)
         finish(evaluation, store, outputs)
@@ -337,14 +354,16 @@ def frame(
 
         opened = Store.open(store)
         from service.frame_choice import Demand, render_chosen
+        from service.progress import RichProgress
 
         name = _load(scene, None).digest if Path(scene).is_file() else scene
         demand = Demand(quality=quality, max_ms=max_ms, min_psnr=min_psnr)
-        rendered, choice = render_chosen(opened, name, camera, demand)
+        with RichProgress() as progress, progress.busy("open the scene and render"):
+            rendered, choice = render_chosen(opened, name, camera, demand)
         write_file(output, encode(rendered.radiance, rendered.exposure, media_type))
         times = ", ".join(f"{step} {1e3 * seconds:.1f} ms" for step, seconds in rendered.seconds.items())
         print(f"{output}: {width}x{height}, {times}, coverage {100 * rendered.coverage:.1f} %, "
-              f"non-finite pixels {rendered.non_finite}")  # fmt: skip
+              f"non-finite values {rendered.non_finite}")  # fmt: skip
         if choice is not None:
             print(f"operating point {choice.point.name!r}: {choice.point.psnr:.2f} dB measured, "
                   f"{choice.ms:.1f} ms predicted")  # fmt: skip
@@ -367,6 +386,10 @@ def serve(
         list[str] | None,
         typer.Option("--preload", help="open this scene before /readyz says ready; may be given again"),
     ] = None,
+    compile_: Annotated[
+        bool,
+        typer.Option("--compile", help="try compiled networks; the first frame of a size then takes tens of seconds"),
+    ] = False,
 ) -> None:
     """Run jobs and answer frame requests over HTTP; /docs describes it. Also reads LIGHTWELL_* variables."""
     with reported():
@@ -374,7 +397,8 @@ def serve(
         from service.serving import serve_store
 
         config = load_config(store_url=store, host=host, port=port, scenes_folder=scenes, scheduler=scheduler,
-                             workers=num_workers, allow_unauthenticated=allow_unauthenticated or None)  # fmt: skip
+                             workers=num_workers, allow_unauthenticated=allow_unauthenticated or None,
+                             compile=compile_ or None)  # fmt: skip
         serve_store(config, preload or ())
 
 

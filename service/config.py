@@ -31,6 +31,7 @@ class ServiceConfig(BaseSettings):
     database_url: str | None = Field(None, description="jobs; default: jobs.sqlite in a local store", repr=False)
     scheduler: str | None = Field(None, description="address of a Dask scheduler; default: a cluster of its own")
     workers: int = Field(1, ge=1, le=1024, description="worker processes of that cluster")
+    compile: bool = Field(False, description="try compiled networks; a frame size's first frame takes tens of seconds")
     queue_limit: int = Field(64, ge=1, description="frame requests that may wait")
     memory_limit: int = Field(4 << 30, ge=1 << 20, description="bytes of open scenes")
 

@@ -8,6 +8,7 @@ from service.unit_task import Executor, Recycling, execute_stages
 from workers.thread_policy import ThreadPolicy
 
 if TYPE_CHECKING:
+    from service.unit_request import UnitTotals
     from workers.job_spec import JobSpec
 
 
@@ -42,6 +43,11 @@ class DaskRunner:
     def slots(self) -> int:
         """Units that the connected workers run at once."""
         return self._board.slots
+
+    @property
+    def totals(self) -> "UnitTotals":
+        """Units that ended since the start, by stage."""
+        return self._board.totals
 
     def run(
         self, job_id: str, spec: "JobSpec", on_event: Callable[[Event], None], should_stop: Callable[[], Stop | None]

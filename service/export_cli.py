@@ -23,14 +23,16 @@ def export(
         if output.suffix.lower() != ".onnx":
             raise OptionError(f"--output must be an .onnx file, got {str(output)!r}")
         check_writable(output, "--output")
+        from service.progress import RichProgress
         from storage.store import Store
 
         opened = Store.open(store)
         from workers.export import export_scene
         from workers.scene import load_scene
 
-        name = load_scene(scene).digest if Path(scene).is_file() else scene
-        exported = export_scene(opened, name, tolerance=tolerance)
+        with RichProgress() as progress, progress.busy("export and check"):
+            name = load_scene(scene).digest if Path(scene).is_file() else scene
+            exported = export_scene(opened, name, tolerance=tolerance)
         write_file(output, exported.data)
         print(f"{output}: {len(exported.data) / 1e6:.2f} MB, within {exported.error:.2g} of PyTorch in exposed "
               f"radiance on {exported.num_pixels} pixels of queried features (tolerance {tolerance:g})")  # fmt: skip

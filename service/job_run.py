@@ -245,7 +245,7 @@ class JobRun:
             if REPORT_FILE in (self._store.committed(ref) or {}).get("files", {}):
                 self._on_event({"kind": "report", "html": self._store.read(ref, REPORT_FILE).decode()})
         return {
-            "evaluation": evaluation, "units": sum(run.block.total for run in self._runs.values()),
-            "computed": sum(run.computed for run in self._runs.values()), "set_aside": self._set_aside,
+            "evaluation": evaluation, "units": sum(run.computed for run in self._runs.values()),
+            "planned_units": sum(run.block.total for run in self._runs.values()), "set_aside": self._set_aside,
             "scene": self._census.digest, "network_key": self._answers.get("train"), "evaluation_key": evaluation_key,
         }  # fmt: skip

@@ -51,7 +51,8 @@ class JobRunner(Protocol):
             should_stop: asked between passes, cheap; not None: raise `JobStopped` with it within 10 s.
 
         Returns:
-            {"evaluation": dict | None, "units": int, "set_aside": [{"unit", "reason", "attempts"}]}
+            {"evaluation": dict | None, "units": int, "set_aside": [{"unit", "reason", "attempts"}]}; units that were
+            computed, not those that the store had.
 
         Raises:
             JobStopped: it was asked to stop.

@@ -50,7 +50,7 @@ def look_at_text(camera: "Camera") -> str:
 
 
 def parse_overrides(assignments: list[str]) -> dict[str, str]:
-    """["bake.diffuse_spp=256", ...] as a mapping; the settings check keys and values.
+    """["cache.diffuse_spp=256", ...] as a mapping; the settings check keys and values.
 
     Raises:
         OptionError: no "=" or no key, or one key given twice.
@@ -59,7 +59,7 @@ def parse_overrides(assignments: list[str]) -> dict[str, str]:
     for assignment in assignments:
         key, separator, value = assignment.partition("=")
         if not separator or not key.strip():
-            raise OptionError(f"--set must be key=value such as bake.diffuse_spp=256, got {assignment!r}")
+            raise OptionError(f"--set must be key=value such as cache.diffuse_spp=256, got {assignment!r}")
         if key.strip() in overrides:
             raise OptionError(f"--set must give each key once, got {key.strip()!r} twice")
         overrides[key.strip()] = value.strip()

@@ -70,6 +70,13 @@ class RichProgress(Progress):
         elapsed_s = self._bars.tasks[self._bars.task_ids.index(task)].elapsed or 0.0
         self._line(f"{description}: done in {elapsed_s:.1f} s")
 
+    @contextmanager
+    def busy(self, description: str) -> Iterator[None]:
+        """A bar without steps, for work that cannot say how far it is; on a terminal alone."""
+        task = self._bars.add_task(escape(description), total=None, note="")
+        yield
+        self._bars.update(task, total=1, completed=1)
+
     def message(self, text: str) -> None:
         """A line above the bars."""
         self._console.print(escape(text), highlight=False, soft_wrap=True)

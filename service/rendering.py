@@ -56,15 +56,16 @@ class StoreBackend:
 
     Args:
         store_url: a folder or fsspec URL that holds a store.
+        compile: try a compiled network for each frame size of the published runs (tens of seconds once a size).
 
     Raises:
         StorageError: there is no store at the URL.
     """
 
-    def __init__(self, store_url: str) -> None:
+    def __init__(self, store_url: str, *, compile: bool = False) -> None:
         from storage.store import Store
 
-        self._store = Store.open(store_url)
+        self._store, self._compile = Store.open(store_url), compile
 
     def scenes(self) -> list[Entry]:
         from workers.published import renderable_scenes
@@ -77,7 +78,9 @@ class StoreBackend:
     def open(self, digest: str) -> Renderer:
         from workers.point_renderer import PointRenderer
 
-        return PointRenderer.open(self._store, digest)
+        renderer = PointRenderer.open(self._store, digest, compile=self._compile)
+        log.info("scene %s: network %s", digest[:12], renderer.reconstructor.choices)
+        return renderer
 
     def choose(self, digest: str, demand: Demand, width: int, height: int, slowdown: float = 1.0) -> "OperatingPoint":
         choice = choose_point(self._store, digest, demand, width, height, slowdown)

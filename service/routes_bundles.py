@@ -144,12 +144,15 @@ def add_bundle_routes(
         f"{UPLOAD_PATH}/{{bundle_id}}",
         summary="Delete a bundle",
         status_code=204,
-        responses=_problems(_404="no such bundle", _409="jobs still read it"),
+        responses=_problems(_404="no such bundle", _409="jobs or served scenes still read it"),
     )
     async def delete_bundle(bundle_id: str) -> None:
         await asyncio.to_thread(store.get, bundle_id)
-        if in_use(bundle_id):
-            raise BundleInUseError(f"bundle must not be read by a job, got {bundle_id}; cancel its jobs first")
+        if await asyncio.to_thread(in_use, bundle_id):
+            raise BundleInUseError(
+                f"bundle must not be read by a job or a scene that is served, got {bundle_id}; "
+                "cancel its jobs, or remove its scenes from the store first"
+            )
         await asyncio.to_thread(store.delete, bundle_id)
 
 

@@ -6,18 +6,23 @@ GET    /v1/jobs/{id}                one job
 DELETE /v1/jobs/{id}                cancel; also POST .../pause, .../resume, .../retry
 GET    /v1/jobs/{id}/events         server-sent events, resumed by Last-Event-ID
 GET    /v1/jobs/{id}/preview.png    the latest pass;  .../result  as JSON;  .../report  as a page
+GET    /v1/jobs/{id}/dataset        its frames as a zip
 POST   /v1/plan                     what a job would do and cost
 """
 
 import asyncio
+import pathlib
+import shutil
+import tempfile
 from collections.abc import Callable
 from typing import Annotated, Any
 
 from fastapi import APIRouter, FastAPI, Header, Path, Query, Response
-from fastapi.responses import HTMLResponse
+from fastapi.responses import FileResponse, HTMLResponse
 from fastapi.sse import EventSourceResponse
+from starlette.background import BackgroundTask
 
-from service.errors import NotReadyError
+from service.errors import BusyError, NotReadyError
 from service.jobs.models import Job
 from service.jobs.report import job_report
 from service.jobs.run import PREVIEW, REPORT
@@ -53,13 +58,14 @@ EVENT_SCHEMA = {
 STREAM_HEADERS = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}
 
 
-def add_job_routes(app: FastAPI, jobs: Jobs) -> None:
-    """Adds jobs and plans to an app; whoever owns the app starts and closes `jobs`."""
+def add_job_routes(app: FastAPI, jobs: Jobs, store_url: str) -> None:
+    """Adds jobs and plans to an app; whoever owns the app starts and closes `jobs`, whose units `store_url` holds."""
     router = APIRouter(prefix="/v1", tags=["jobs"])
     _add_submission(router, jobs)
     _add_views(router, jobs)
     _add_wishes(router, jobs)
     _add_files(router, jobs)
+    _add_dataset(router, jobs, store_url)
     app.include_router(router)
 
 
@@ -158,6 +164,39 @@ def _add_files(router: APIRouter, jobs: Jobs) -> None:
         job = jobs.table.get(job_id, with_result=True)
         kept = jobs.table.file(job, REPORT)
         return HTMLResponse(kept.decode() if kept is not None else job_report(job.id, _result(job)))
+
+
+def _add_dataset(router: APIRouter, jobs: Jobs, store_url: str) -> None:
+    packing = asyncio.Lock()
+
+    @router.get(
+        "/jobs/{job_id}/dataset", summary="A job's frames as a dataset in one zip",
+        description="References, albedo, normals and standard errors by camera path, with a manifest, as `lightwell "
+        "dataset` writes them. One is packed at a time.",
+        response_class=FileResponse,
+        responses=problem_responses(404, 409, 422, 503)
+        | {200: {"description": "the archive", "content": {"application/zip": BINARY}}},
+    )  # fmt: skip
+    async def dataset(job_id: JobId) -> FileResponse:
+        job = await asyncio.to_thread(jobs.table.get, job_id)
+        stages = job.spec.get("stages") or ()
+        if job.state != State.COMPLETE or "render" not in stages:
+            raise NotReadyError(
+                f"job {job_id} must have rendered its frames for a dataset, it is {job.state} with {', '.join(stages)}"
+            )
+        if packing.locked():
+            raise BusyError("one dataset is packed at a time; ask again later")
+        async with packing:
+            folder = pathlib.Path(await asyncio.to_thread(tempfile.mkdtemp, prefix="lightwell-dataset-"))
+            try:
+                await asyncio.to_thread(jobs.pack, store_url, job.spec, folder / "dataset.zip")
+            except BaseException:
+                shutil.rmtree(folder, ignore_errors=True)
+                raise
+        leave = BackgroundTask(shutil.rmtree, folder, ignore_errors=True)
+        return FileResponse(
+            folder / "dataset.zip", media_type="application/zip", filename=f"{job_id}.zip", background=leave
+        )
 
 
 def _result(job: Job) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from service.cluster import Cluster, SchedulerError
-from service.unit_request import Listener, Outcome, UnitRequest
+from service.unit_request import Listener, Outcome, UnitRequest, UnitTotals
 from service.unit_task import Executor, Recycling, UnitError, run_unit
 from workers.errors import StoppedError
 from workers.job_spec import JobSpec
@@ -53,6 +53,7 @@ class UnitBoard:
         self._keys: dict[str, UnitRequest] = {}
         self._waiting: collections.deque[UnitRequest] = collections.deque()
         self._leaving: dict[str, tuple[str, float]] = {}
+        self.totals = UnitTotals()
         self._connected = True
         self._slots, self._has_gpu = num_workers, False
         self._closed = threading.Event()
@@ -144,7 +145,7 @@ class UnitBoard:
         resources = {"gpu": 1} if self._has_gpu and entry.unit.stage == _GPU_STAGE else None
         arguments = (self._executor, entry.unit, entry.spec, self._store_url, key, self._recycling)
         preferred = {"workers": others, "allow_other_workers": True} if others else {}
-        entry.key, entry.worker, entry.address = key, None, None
+        entry.key, entry.worker, entry.address, entry.began_s = key, None, None, time.monotonic()
         self._keys[key] = entry
         entry.future = client.submit(run_unit, *arguments, key=key, resources=resources, pure=False, **preferred)
         entry.future.add_done_callback(lambda future: self._inbox.put(("ended", entry, future)))
@@ -198,6 +199,7 @@ class UnitBoard:
         self._waiting.append(entry)
 
     def _finish(self, entry: UnitRequest, outcome: Outcome) -> None:
+        self.totals.add(entry.unit, time.monotonic() - entry.began_s, done=outcome.kind == "done")
         with self._lock:
             if self._entries.get(entry.identity) is entry:
                 del self._entries[entry.identity]
@@ -222,7 +224,7 @@ class UnitBoard:
         if entry is None:
             return
         if event["kind"] == "began":
-            entry.worker, entry.address = event["name"], event["address"]
+            entry.worker, entry.address, entry.began_s = event["name"], event["address"], time.monotonic()
         elif event["kind"] == "progress":
             values = {name: event[name] for name in ("done", "total", "note")}
             entry.tell(Outcome(entry.identity, "progress", **values))

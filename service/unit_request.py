@@ -1,6 +1,7 @@
 """A unit that somebody wants, and the news that those who want it get."""
 
 import queue
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -40,6 +41,26 @@ class Listener:
         self.outcomes: queue.SimpleQueue[Outcome] = queue.SimpleQueue()
 
 
+class UnitTotals:
+    """Units that ended since the start, by stage; written by the board's thread, read by any.
+
+    Attributes:
+        units: computed.
+        seconds: that their last attempts took.
+        set_aside: given up.
+    """
+
+    def __init__(self) -> None:
+        self.units: Counter[str] = Counter()
+        self.seconds: dict[str, float] = {}
+        self.set_aside: Counter[str] = Counter()
+
+    def add(self, unit: Unit, seconds: float, *, done: bool) -> None:
+        """Counts a unit that ended."""
+        (self.units if done else self.set_aside)[unit.stage] += unit.count
+        self.seconds[unit.stage] = self.seconds.get(unit.stage, 0.0) + seconds
+
+
 @dataclass(eq=False)
 class UnitRequest:
     """A unit that somebody wants."""
@@ -55,6 +76,7 @@ class UnitRequest:
     future: "Future | None" = None
     worker: str | None = None
     address: str | None = None
+    began_s: float = 0.0  # of this attempt, by time.monotonic
 
     def tell(self, outcome: Outcome) -> None:
         for listener in list(self.listeners):

@@ -33,6 +33,7 @@ def verify(
 
 def _check(url: str, repair: bool) -> tuple[int, int]:
     """Prints one line a problem; returns how many there were and how many were repaired."""
+    from service.progress import RichProgress
     from storage.verification import find_problems
     from storage.verification import repair as repair_problem
 
@@ -44,10 +45,11 @@ def _check(url: str, repair: bool) -> tuple[int, int]:
         if repair:
             store.write_header()
             num_repaired += 1
-    for problem in find_problems(store):
-        print(problem.text)
-        num_problems += 1
-        num_repaired += repair and repair_problem(store, problem)
+    with RichProgress() as progress, progress.busy("read every file"):
+        for problem in find_problems(store):
+            print(problem.text)
+            num_problems += 1
+            num_repaired += repair and repair_problem(store, problem)
     for record in store.quarantined():
         unit = "" if record["unit"] is None else f" unit {record['unit']}"
         print(f"set aside, {record['attempts']}x ({record['cause']}): {record['stage']}/{record['key']}{unit}: "

@@ -1,7 +1,8 @@
 """The entries of a store's scenes: name, facts and the run that is served. Each carries a checksum of itself."""
 
 import json
-from collections.abc import Mapping
+import logging
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from storage import layout, markers
@@ -9,7 +10,10 @@ from storage.durable import FileTree
 from storage.errors import DamagedUnitError, SceneNotFoundError
 from storage.keys import plain
 
+log = logging.getLogger("lightwell.storage")
+
 _OLDEST_SEALED_LAYOUT = 2
+_told: set[str] = set()  # damaged entries that the log has named
 
 
 def register(files: FileTree, digest: str, info: Mapping[str, Any]) -> dict[str, Any]:
@@ -22,13 +26,29 @@ def register(files: FileTree, digest: str, info: Mapping[str, Any]) -> dict[str,
 def entries(files: FileTree, layout_version: int) -> list[dict[str, Any]]:
     """Entries of the registered scenes by name.
 
-    Raises:
-        DamagedUnitError: one of them is not what was written.
+    One that cannot be read is left out and named in the log: it must take no other scene with it. `damaged` finds it.
     """
-    paths = [layout.scene_file(digest) for digest in files.names(layout.SCENES) if layout.is_segment(digest)]
-    contents = files.read_each(dict.fromkeys(paths, 0))
-    found = [parse(files, path, data, layout_version) for path, data in contents if data is not None]
+    found = [entry for entry, _ in _read(files, layout_version) if entry is not None]
     return sorted(found, key=lambda entry: (str(entry["name"]), entry["digest"]))
+
+
+def damaged(files: FileTree, layout_version: int) -> list[DamagedUnitError]:
+    """What is wrong with the entries that cannot be read."""
+    return [error for _, error in _read(files, layout_version) if error is not None]
+
+
+def _read(files: FileTree, layout_version: int) -> Iterator[tuple[dict[str, Any] | None, DamagedUnitError | None]]:
+    paths = [layout.scene_file(digest) for digest in files.names(layout.SCENES) if layout.is_segment(digest)]
+    for path, data in files.read_each(dict.fromkeys(paths, 0)):
+        if data is None:
+            continue
+        try:
+            yield parse(files, path, data, layout_version), None
+        except DamagedUnitError as error:
+            if str(error) not in _told:
+                _told.add(str(error))
+                log.warning("a scene is left out: %s", error)
+            yield None, error
 
 
 def find(scenes: list[dict[str, Any]], name_or_digest: str, url: str) -> dict[str, Any]:

@@ -6,7 +6,13 @@ from typing import Any
 
 from storage import layout, markers, quarantine, scenes
 from storage.durable import FileTree
-from storage.errors import DamagedUnitError, MissingUnitError, StoreNotFoundError, StoreVersionError
+from storage.errors import (
+    DamagedUnitError,
+    MissingUnitError,
+    SceneNotFoundError,
+    StoreNotFoundError,
+    StoreVersionError,
+)
 from storage.keys import seed_from_key
 from storage.layout import UnitRef
 from storage.verification import difference, find_problems
@@ -73,8 +79,7 @@ class Store:
     def scenes(self) -> list[dict[str, Any]]:
         """Lists the registered scenes by name.
 
-        Raises:
-            DamagedUnitError: a scene's entry cannot be read.
+        An entry that cannot be read is left out; `verify` and the log name it.
         """
         return scenes.entries(self.files, self.layout_version)
 
@@ -83,8 +88,14 @@ class Store:
 
         Raises:
             SceneNotFoundError: none or several match.
+            DamagedUnitError: none matches, and an entry cannot be read that may be the one.
         """
-        return scenes.find(self.scenes(), name_or_digest, self.url)
+        try:
+            return scenes.find(self.scenes(), name_or_digest, self.url)
+        except SceneNotFoundError:
+            for error in scenes.damaged(self.files, self.layout_version):
+                raise error from None
+            raise
 
     # ----------------------------------------------------------------- units
 

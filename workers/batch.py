@@ -141,7 +141,7 @@ def run_item(item: BatchItem, run: RunState, units: list[FrameUnit]) -> None:
     scene = run.scene
     # Not by listing what the store knows: a batch has as many scenes as combinations.
     if run.store.files.read(scene_file(scene.digest)) is None:
-        facts = {"name": scene.name, "source": scene.source, "variation": dict(scene.variation)}
+        facts = {"name": scene.name, "source": scene.address, "variation": dict(scene.variation)}
         run.store.register_scene(scene.digest, facts)
     render_frames(run, units)
     if "train" in item.stages:  # the pipeline trains and measures in one go; the frames are there by now

@@ -152,7 +152,7 @@ def measure(
     settings = Settings.from_json(request.settings)
     scene = load_scene(request.source, width=settings.width, height=settings.height)
     scene, triangles, rule = with_triangles(scene, request.target)
-    store.register_scene(scene.digest, {"name": scene.name, "source": str(scene.source)})
+    store.register_scene(scene.digest, {"name": scene.name, "source": scene.address})
     run = RunState(scene, store, settings)
     told("elements")
     elements, elements_s = _timed_elements(run)

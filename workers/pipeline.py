@@ -31,7 +31,7 @@ from workers.scene_plan import plan_rows
 from workers.settings import Settings
 from workers.train import run_train, train_ref
 
-__all__ = ["Evaluation", "Picture", "evaluate_scene", "plan_scene", "run_scene"]
+__all__ = ["Evaluation", "Picture", "evaluate_scene", "plan_scene", "published_settings", "run_scene"]
 
 RENDER_STAGES = {"train": "render training frames", "validation": "render validation frames",
                  "test": "render test references"}  # fmt: skip
@@ -57,7 +57,7 @@ def run_scene(
     """
     width, height = camera_size or (settings.width, settings.height)
     run = RunState(scene, store, settings.override({"width": width, "height": height}), progress)
-    store.register_scene(scene.digest, known_facts(store, scene) | {"name": scene.name, "source": str(scene.source)})
+    store.register_scene(scene.digest, known_facts(store, scene) | {"name": scene.name, "source": scene.address})
     run = planned_run(run)
     elements = run_elements(run)
     run_bake(run, elements)
@@ -79,27 +79,48 @@ def run_scene(
 
 
 def evaluate_scene(scene: Scene, store: Store, settings: Settings, progress: Progress) -> Evaluation:
-    """Evaluates what `run_scene` prepared with the settings that it used.
+    """Evaluates what `run_scene` prepared.
+
+    Args:
+        scene: the scene.
+        store: where its stages lie.
+        settings: those that the run used (`published_settings`), but for `evaluation`, which may be others.
+        progress: told about it.
 
     Raises:
-        WorkerError: a stage has not run, or another version ran it.
+        WorkerError: a stage has not run with these settings, or another version ran it.
     """
     entry = known_facts(store, scene)
     if "network" in entry:
         check_versions(entry, store.url)
-    used = Settings.from_json(entry["settings"]) if "settings" in entry else settings
-    run = planned_run(RunState(scene, store, used, progress))
+    run = planned_run(RunState(scene, store, settings, progress))
     elements = run_elements(run)
     renders = {name: [render_ref(run, camera, spp) for camera in cameras] for name, cameras, spp in (
-        ("train", run.paths.train, used.frames.train_spp), ("test", run.paths.test, used.frames.test_spp))}  # fmt: skip
+        ("train", run.paths.train, run.settings.frames.train_spp),
+        ("test", run.paths.test, run.settings.frames.test_spp))}  # fmt: skip
     network = train_ref(run, [inputs_ref(run, elements, camera) for camera in run.paths.train], renders["train"])
     needed = [network, *renders["test"], *bake_refs(run, elements).values()]
     if any(store.committed(ref) is None for ref in needed):
         raise WorkerError(
-            f"scene {scene.name!r} must be run before it is evaluated; "
+            f"scene {scene.name!r} must be run with these settings before it is evaluated; "
             f"run: lightwell run {scene.source} --store {store.url}"
         )
     return evaluate_run(run, elements, query_program(run, elements), network, renders["test"])
+
+
+def published_settings(scene: Scene, store: Store) -> Settings:
+    """Settings of the run that the scene is served from.
+
+    Raises:
+        WorkerError: it was never run to its end.
+    """
+    entry = known_facts(store, scene)
+    if "settings" not in entry:
+        raise WorkerError(
+            f"scene {scene.name!r} must be run before it is evaluated; "
+            f"run: lightwell run {scene.source} --store {store.url}"
+        )
+    return Settings.from_json(entry["settings"])
 
 
 def known_facts(store: Store, scene: Scene) -> dict[str, Any]:

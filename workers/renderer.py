@@ -144,7 +144,7 @@ def publish(run: RunState, network_ref: UnitRef, psnr: float | None) -> None:
     run.store.register_scene(
         run.scene.digest,
         {
-            "name": run.scene.name, "source": str(run.scene.source), "settings": run.settings.to_json(),
+            "name": run.scene.name, "source": run.scene.address, "settings": run.settings.to_json(),
             "network": network_ref.key, "width": run.settings.width, "height": run.settings.height,
             "preset": run.settings.preset, "psnr": psnr, ENTRY: code_versions(),
         },

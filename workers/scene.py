@@ -78,6 +78,12 @@ class Scene:
     variation: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
 
     @property
+    def address(self) -> str:
+        """The source as it is found from any folder: a file's path is absolute. What a store keeps."""
+        base, _ = split_source(self.source)
+        return f"{Path(base).resolve()}{self.source[len(base) :]}" if Path(base).is_file() else self.source
+
+    @property
     def bounds_centre(self) -> np.ndarray:
         """[3] centre of the bounding box, scene units."""
         return self.frame.file_points(bounds(self.mi_scene)[0])

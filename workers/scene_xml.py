@@ -1,6 +1,7 @@
 """Mitsuba XML: the file's own scene, nothing added."""
 
 import re
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +11,7 @@ from workers.backend import mi
 from workers.scene_draft import SceneDraft, file_hash
 from workers.scene_nodes import parse_state, resolve_files
 
+_resolver_lock = threading.Lock()
 _SPECTRUM_FILE = re.compile(r"<spectrum\b[^>]*\bfilename\s*=\s*[\"']([^\"']+)[\"']")
 
 
@@ -34,14 +36,15 @@ def read_xml(path: Path) -> SceneDraft:
 def _search_folder(folder: Path) -> Iterator[None]:
     """Let Mitsuba look into the scene's folder: the parser reads spectra while it parses."""
     mitsuba: Any = mi  # its stubs hide these functions
-    before = mitsuba.file_resolver()
-    resolver = mitsuba.FileResolver(before)
-    resolver.prepend(str(folder))
-    mitsuba.set_file_resolver(resolver)
-    try:
-        yield
-    finally:
-        mitsuba.set_file_resolver(before)
+    with _resolver_lock:  # the resolver is the process's
+        before = mitsuba.file_resolver()
+        resolver = mitsuba.FileResolver(before)
+        resolver.prepend(str(folder))
+        mitsuba.set_file_resolver(resolver)
+        try:
+            yield
+        finally:
+            mitsuba.set_file_resolver(before)
 
 
 def _spectrum_files(parsed: list[Path], folders: list[Path]) -> dict[str, Path]:

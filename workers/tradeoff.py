@@ -62,7 +62,7 @@ def run_tradeoff(
     torch.set_num_threads(dr.thread_count())
     known = next((entry for entry in store.scenes() if entry["digest"] == scene.digest), None)
     if known is None:
-        store.register_scene(scene.digest, {"name": scene.name, "source": str(scene.source)})
+        store.register_scene(scene.digest, {"name": scene.name, "source": scene.address})
     base = base_run(planned_run(RunState(scene, store, settings, progress)), budget)
     prepared = prepare_variants(base, budget)
     test_refs = run_render(base, base.paths.test, base.settings.frames.test_spp, "render test references")

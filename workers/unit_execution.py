@@ -111,7 +111,7 @@ def spp_of(run: RunState, path: str) -> int:
 
 def _census(run: RunState) -> dict[str, Any]:
     """What the scene alone decides; registers the scene, so that the store knows its name from the start."""
-    facts = {"name": run.scene.name, "source": str(run.scene.source)}
+    facts = {"name": run.scene.name, "source": run.scene.address}
     known = known_facts(run.store, run.scene)
     if known | facts != known:
         run.store.register_scene(run.scene.digest, known | facts)

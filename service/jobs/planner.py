@@ -1,10 +1,11 @@
-"""Plans on a thread of their own, one after the other: a plan loads the scene and casts rays for seconds."""
+"""Plans, one after the other, each in a process of its own: a plan loads a scene, bakes and trains for seconds."""
 
 import asyncio
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
+from service.apart import run_apart
 from service.errors import BusyError
 
 if TYPE_CHECKING:
@@ -21,6 +22,11 @@ def plan_source(source: str, settings: "Settings") -> dict[str, Any]:
     return plan_scene(load_scene(source, width=settings.width, height=settings.height), settings)
 
 
+def plan_apart(source: str, settings: "Settings") -> dict[str, Any]:
+    """`plan_source` in a process of its own."""
+    return run_apart(plan_source, source, settings)
+
+
 class Planner:
     """Makes plans.
 
@@ -28,7 +34,7 @@ class Planner:
         make_plan: what makes one; called on the planner's thread.
     """
 
-    def __init__(self, make_plan: "Callable[[str, Settings], dict[str, Any]]" = plan_source) -> None:
+    def __init__(self, make_plan: "Callable[[str, Settings], dict[str, Any]]" = plan_apart) -> None:
         self._make_plan = make_plan
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="lightwell-plan")
         self._waiting = 0

@@ -1,13 +1,19 @@
 """The parts that jobs need, put together: table, dispatcher, the desk that checks requests, the planner."""
 
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
 from service.job_runner import JobRunner
 from service.jobs.database import Database, default_url
+from service.jobs.dataset import pack_apart
 from service.jobs.dispatcher import Dispatcher
 from service.jobs.planner import Planner
 from service.jobs.states import TERMINAL, State
 from service.jobs.stream import HEARTBEAT_S
 from service.jobs.submission import Desk
 from service.jobs.table import JobTable
+from service.unit_request import UnitTotals
 
 MAX_UNFINISHED = 10_000  # jobs looked at for a bundle that is to be deleted
 
@@ -20,6 +26,7 @@ class Jobs:
         runner: what runs a job.
         desk: what checks a request.
         planner: what makes plans.
+        pack: writes a finished job's dataset: (store's URL, job's spec, zip file).
         dispatcher_options: `num_threads`, `lease_s` and `poll_s` of the dispatcher.
         heartbeat_s: of event streams.
 
@@ -35,12 +42,15 @@ class Jobs:
         desk: Desk,
         *,
         planner: Planner | None = None,
+        pack: Callable[[str, dict[str, Any], Path], None] = pack_apart,
         dispatcher_options: dict[str, float] | None = None,
         heartbeat_s: float = HEARTBEAT_S,
     ) -> None:
         self.database = Database(database_url)
         self.table = JobTable(self.database)
+        self.unit_totals: UnitTotals | None = getattr(runner, "totals", None)
         self.desk, self.planner, self.heartbeat_s = desk, planner or Planner(), heartbeat_s
+        self.pack = pack
         self.dispatcher = Dispatcher(self.table, runner, **(dispatcher_options or {}))  # type: ignore[arg-type]
 
     @classmethod

@@ -86,7 +86,7 @@ class Desk:
                 f"frames must have at most {self.max_pixels} pixels, got {settings.width}x{settings.height}; "
                 "set width and height"
             )
-        spp = max(settings.frames.train_spp, settings.frames.test_spp)
+        spp = max(settings.frames.train_spp, settings.frames.test_spp, *settings.evaluation.spp)
         if spp > self.max_spp:
             raise JobRequestError(f"frames must have at most {self.max_spp} paths a pixel, got {spp}")
 

@@ -348,6 +348,7 @@ class FakeScene:
     name: str = "hall"
     digest: str = "d1"
     source: str = "hall.xml"
+    address: str = "/scenes/hall.xml"
     settings: dict[str, Any] = dataclasses.field(default_factory=dict)
     notes: tuple[str, ...] = ()
     camera: Camera = dataclasses.field(

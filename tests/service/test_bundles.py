@@ -20,6 +20,7 @@ from service.config import ServiceConfig
 from service.errors import BundleStorageError, UnknownBundleError, UnknownSceneError
 from service.routes_bundles import add_bundle_routes
 from service.scene_sources import BUILTIN_NAMES, SceneSources
+from storage.store import Store
 from tests.service.bundle_packing import GLTF, PLY, TRIANGLE, YAML, glb, info_of, pack, pack_infos, png, xml
 from tests.workers.plugin_scenes import write_plugin_scene
 
@@ -221,6 +222,15 @@ def test_a_bundle_in_use_is_not_deleted(tmp_path: Path, config: ServiceConfig) -
     bundle = accepted(client, {"scene.xml": xml("")})
     assert client.delete(f"/v1/bundles/{bundle['id']}").status_code == 409
     assert client.get(f"/v1/bundles/{bundle['id']}").status_code == 200
+
+
+def test_a_bundle_whose_scene_is_served_is_not_deleted(client: TestClient, config: ServiceConfig) -> None:
+    bundle = accepted(client, {"scene.xml": xml("")})
+    store = Store.open(config.store_url, create=True)
+    store.register_scene("d1", {"name": "hall", "source": str(config.bundles_path / bundle["id"] / "scene.xml")})
+    assert client.delete(f"/v1/bundles/{bundle['id']}").status_code == 409
+    store.register_scene("d1", {"name": "hall", "source": "/elsewhere/scene.xml"})
+    assert client.delete(f"/v1/bundles/{bundle['id']}").status_code == 204
 
 
 def test_what_a_crash_left_is_swept_and_what_is_being_received_is_not(config: ServiceConfig) -> None:

@@ -19,6 +19,7 @@ from service.cli import app
 from storage.store import Store
 from workers.camera import Camera
 from workers.errors import SceneError
+from workers.settings import Settings
 
 COMMANDS = ("demo", "plan", "run", "frame", "evaluate", "serve")
 
@@ -56,6 +57,9 @@ def calls(monkeypatch: pytest.MonkeyPatch, evaluation: Any, backend: Any) -> lis
         calls.append(("evaluate_scene", {"settings": settings}))
         return evaluation
 
+    def published_settings(scene: Any, store: Store) -> Any:
+        return Settings.preset_named("draft").override({"width": 48, "height": 32, "cache.polar": 7})
+
     def plan_scene(scene: Any, settings: Any) -> dict[str, Any]:
         return {"rows": [{"item": "elements", "choice": "lattice", "reason": "walls are large"}],
                 "cost": {"paths": 1e6, "seconds": 60, "nbytes": 1024}}  # fmt: skip
@@ -70,6 +74,7 @@ def calls(monkeypatch: pytest.MonkeyPatch, evaluation: Any, backend: Any) -> lis
             "run_scene": run_scene,
             "evaluate_scene": evaluate_scene,
             "plan_scene": plan_scene,
+            "published_settings": published_settings,
         },
         "workers.renderer": {"FrameRenderer": types.SimpleNamespace(open=open_renderer)},
     }
@@ -182,11 +187,21 @@ def test_planned_run_asks_for_a_plan_and_keeps_what_was_set(calls: Any, store: s
     assert [(plan.mode, plan.keep) for plan in plans] == [("adaptive", ("cache.polar",)), ("preset", ())]
 
 
-def test_evaluate_prints_the_table(calls: Any, store: str) -> None:
+def test_evaluate_measures_the_served_run_with_its_own_settings(calls: Any, store: str) -> None:
     Store.open(store, create=True)
-    result = invoke("evaluate", "scene.xml", "--store", store)
+    result = invoke("evaluate", "scene.xml", "--store", store, "--set", "evaluation.spp=2,64")
     assert result.exit_code == 0 and "pt-1+oidn-high" in result.stdout
-    assert [name for name, _ in calls] == ["load_scene", "evaluate_scene"]
+    assert calls[-1][0] == "evaluate_scene"
+    used = calls[-1][1]["settings"]
+    assert (used.width, used.cache.polar, used.evaluation.spp, used.preset) == (48, 7, (2, 64), "draft")
+    assert calls[-2] == ("load_scene", {"source": "scene.xml", "width": 48, "height": 32})
+
+
+def test_evaluate_of_a_named_preset_measures_that_run(calls: Any, store: str) -> None:
+    Store.open(store, create=True)
+    assert invoke("evaluate", "scene.xml", "--store", store, "--preset", "reference").exit_code == 0
+    used = calls[-1][1]["settings"]
+    assert (used.preset, used.width, used.cache.polar) == ("reference", 24, 16)
 
 
 @pytest.mark.parametrize(("name", "kind"), [("f.png", "PNG"), ("f.jpg", "JPEG")])
@@ -199,7 +214,7 @@ def test_frame_writes_the_picture_and_tells_its_times(
     assert result.exit_code == 0, result.output
     picture = read_picture(tmp_path / name)
     assert picture.format == kind and picture.size == (20, 10)
-    assert "query 4.0 ms, network 1.5 ms, coverage 97.5 %, non-finite pixels 0" in result.stdout
+    assert "query 4.0 ms, network 1.5 ms, coverage 97.5 %, non-finite values 0" in result.stdout
     assert calls == [("open_renderer", {"name": "tabletop"})]
 
 

@@ -50,12 +50,13 @@ def wait_for(condition: Callable[[], Any], seconds: float = 15.0) -> None:
 
 
 def test_job_runs_every_unit_once_and_tells_its_progress(runner: DaskRunner, tmp_path: Path) -> None:
-    watch = Watch()
+    watch, before = Watch(), runner.totals.units.total()
     result = watch.run(runner, fake_spec(tmp_path, digest="once"))
+    assert runner.totals.units.total() - before == result["units"] and runner.totals.seconds["bake"] > 0
     assert result["evaluation"]["rows"] == [{"name": "ours", "psnr": None}]
     assert watch.of("report") == [{"kind": "report", "html": "<html>pictures</html>"}]
     assert result["set_aside"] == []
-    assert result["units"] == result["computed"] == 1 + 1 + 1 + 6 + 20 + 1 + 4 + 1 + 1
+    assert result["units"] == result["planned_units"] == 1 + 1 + 1 + 6 + 20 + 1 + 4 + 1 + 1
     assert max(Counter(name for name, _, _ in started(tmp_path)).values()) == 1
     last = {event["stage"]: event for event in watch.of("progress")}
     assert all(event["done"] == event["total"] and event["eta_s"] == 0 for event in last.values())
@@ -83,7 +84,7 @@ def test_job_bakes_a_set_once_the_one_before_it_is_sealed(runner: DaskRunner, tm
     first, both = (fake_spec(tmp_path, ("bake",), digest="chained", chained=chained) for chained in (False, True))
     Watch().run(runner, first)
     result = Watch().run(runner, both)  # nothing is in flight between the stored set and the one after it
-    assert result["computed"] == 2 + 20 + 1  # census and inventory, and the second set with its seal
+    assert result["units"] == 2 + 20 + 1  # census and inventory, and the second set with its seal
     names = [line.strip() for line in (tmp_path / "ended").read_text().splitlines()]
     assert names.index("seal diffuse") < min(i for i, name in enumerate(names) if name.startswith("bake directional"))
 
@@ -128,7 +129,7 @@ def test_job_completes_where_a_worker_is_killed(runner: DaskRunner, tmp_path: Pa
     watch = Watch()
     result = watch.run(runner, fake_spec(tmp_path, digest="killed", killing=["bake diffuse 7-7"]))
     assert result["set_aside"] == []
-    assert result["computed"] == result["units"]
+    assert result["units"] == result["planned_units"]
     retries = watch.of("retry")
     assert [(event["unit"], event["attempt"]) for event in retries] == [("bake diffuse 7-7", 1)]
     assert "worker process died" in retries[0]["reason"]

@@ -89,6 +89,16 @@ class StoreContract:
         for handle in (DIGEST, "Küche ☕", DIGEST[:6]):
             assert store.find_scene(handle) == entry
 
+    def test_a_damaged_entry_takes_no_other_scene_with_it(self, store: Store, caplog: pytest.LogCaptureFixture) -> None:
+        store.register_scene("other", {"name": "hall"})
+        store.files.write(layout.scene_file("other"), b'{"name": "ha')
+        assert [entry["digest"] for entry in store.scenes()] == [DIGEST]
+        assert layout.scene_file("other") in caplog.text and "lightwell verify" in caplog.text
+        assert store.find_scene(DIGEST)["digest"] == DIGEST
+        with pytest.raises(DamagedUnitError, match="must hold the JSON object"):
+            store.find_scene("hall")
+        assert any(layout.scene_file("other") in problem for problem in store.verify())
+
     def test_find_scene_names_the_known_ones(self, store: Store) -> None:
         with pytest.raises(SceneNotFoundError, match="Küche ☕"):
             store.find_scene("Bad")

@@ -1,7 +1,9 @@
 """The main job on `tiny`: every stage, resumed, damaged, and asked over HTTP for a frame."""
 
 import io
+import json
 import time
+import zipfile
 
 import numpy as np
 import pytest
@@ -9,12 +11,15 @@ from fastapi.testclient import TestClient
 from PIL import Image
 
 from service.app import create_app
+from service.jobs.dataset import pack_apart
+from service.jobs.planner import plan_apart
 from storage.caches import CacheSet
 from storage.frames import decode_frame
 from storage.store import Store
 from workers.bake import bake_refs, bake_units, run_bake
 from workers.element_stage import run_elements
-from workers.pipeline import evaluate_scene, run_scene
+from workers.errors import SceneError, WorkerError
+from workers.pipeline import evaluate_scene, published_settings, run_scene
 from workers.progress import Progress
 from workers.renderer import FrameRenderer, renderable_scenes
 from workers.run_state import RunState
@@ -78,6 +83,16 @@ def test_run_again_computes_nothing(prepared, scene, settings):
     assert time.perf_counter() - start < 60
     after = {ref: store.committed(ref)["created_unix_s"] for ref in before}
     assert after == before
+
+
+def test_evaluation_follows_what_it_is_asked_for(prepared, scene, settings):
+    store, _ = prepared
+    assert published_settings(scene, store) == settings
+    asked = settings.override({"evaluation.spp": (2,), "evaluation.qualities": ("fast",)})
+    names = {row["name"] for row in evaluate_scene(scene, store, asked, Progress()).result["rows"]}
+    assert names == {"ours", "ir", "ir+oidn", "pt-2", "pt-2+oidn-fast"}
+    with pytest.raises(WorkerError, match="must be run with these settings"):
+        evaluate_scene(scene, store, settings.override({"cache.diffuse_spp": 32}), Progress())
 
 
 def test_bake_of_a_lost_unit_is_bit_identical(prepared, scene, settings):
@@ -149,6 +164,27 @@ def test_trainer_keeps_its_seconds_where_the_probe_was_wrong(prepared, scene, se
     trainer.fit()
     assert trainer.step == trainer.num_steps
     assert trainer.step * later_s == pytest.approx(budget_s, rel=0.02)
+
+
+def test_frames_of_a_job_are_packed_by_a_process_of_its_own(prepared, settings, tmp_path):
+    store, _ = prepared
+    spec = {"scene": "tiny", "settings": settings.to_json(), "stages": ["bake", "render"]}
+    pack_apart(store.url, spec, tmp_path / "dataset.zip")
+    with zipfile.ZipFile(tmp_path / "dataset.zip") as file:
+        manifest = json.loads(file.read("manifest.json"))
+        assert len(manifest["frames"]) == 7 and manifest["splits"] == {"train": 4, "valid": 1, "test": 2}
+        assert len([name for name in file.namelist() if name.endswith(".hdr.exr")]) == 7
+    assert [path.name for path in tmp_path.iterdir()] == ["dataset.zip"]
+    with pytest.raises(WorkerError, match="must be rendered"):
+        other = settings.override({"frames.train_spp": 16}).to_json()
+        pack_apart(store.url, spec | {"settings": other}, tmp_path / "other.zip")
+
+
+def test_plan_is_made_by_a_process_of_its_own(settings):
+    plan = plan_apart("tiny", settings)
+    assert plan["cost"]["paths"] > 0 and plan["rows"]
+    with pytest.raises(SceneError, match=r"got 'nowhere\.xml'"):
+        plan_apart("nowhere.xml", settings)
 
 
 def test_renderer_answers_a_pose_far_outside_the_domain(prepared, scene):

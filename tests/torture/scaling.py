@@ -59,7 +59,7 @@ def throughput(folder: Path, num_workers: int) -> float:
         seconds, stages, result = timed(runner, tiny_spec_until("render", WORK))
     print(f"{num_workers} workers: {result['computed']} units in {seconds:.2f} s, stages ended at "
           f"{ {name: round(at, 1) for name, at in stages.items()} }")  # fmt: skip
-    return result["computed"] / seconds
+    return result["units"] / seconds
 
 
 def tiny_spec_until(stage: str, settings: dict[str, Any]) -> JobSpec:

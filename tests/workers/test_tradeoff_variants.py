@@ -18,7 +18,10 @@ def test_sweep_begins_with_the_base_and_varies_every_axis() -> None:
                        "cache.azimuth"}  # fmt: skip
     assert {row.scale for row in rows} == {1, 2}
     assert {row.precision for row in rows} >= {"fp32", "bf16"}
-    assert [row.name for row in rows if row.kind == "paper"] == ["paper-exact"]
+    (paper,) = (row for row in rows if row.kind == "paper")
+    exact = DRAFT.override(paper.overrides)
+    assert (exact.cache.azimuth, exact.cache.polar, exact.cache.directional_spp) == (64, 16, 32)
+    assert (exact.train.batch, exact.train.perceptual_every, exact.train.schedule) == (2, 1, "paper")
     assert all(row.kind == "ours" for row in sweep_variants(DRAFT, TradeoffBudget(paper=False)))
 
 

@@ -19,6 +19,7 @@ from sqlalchemy import create_engine, text
 from service.job_runner import JobFailed, JobStopped
 from service.jobs.database import Database
 from service.jobs.table import JobTable, Submission
+from service.unit_request import UnitTotals
 
 POSTGRES_URL = "LIGHTWELL_TEST_POSTGRES"
 """A server to test with, as a URL whose user may create databases; else one is started from its binaries."""
@@ -140,6 +141,7 @@ class FakeRunner:
     most_busy: int = 0
     closed: bool = False
     may_end: threading.Event = field(default_factory=threading.Event)
+    totals: UnitTotals = field(default_factory=UnitTotals)
 
     def __post_init__(self) -> None:
         self.may_end.set()

@@ -2,10 +2,13 @@
 server."""
 
 import contextlib
+import io
 import json
 import re
+import tempfile
 import threading
 import time
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,7 @@ from service.jobs_client import StreamEvent, parse_events
 from service.scene_sources import SceneSources
 from workers.errors import SceneError
 from workers.scene_request import SceneRequest
+from workers.units import Unit
 
 Make = Callable[..., Any]
 BODY = {"scene": "tiny", "preset": "tiny"}
@@ -51,7 +55,12 @@ def jobs(tmp_path: Path, runner: Any, make_plan: Make) -> Jobs:
     desk = Desk(resolve_scene_source=resolve, read_scene=read_scene, max_pixels=100_000, max_spp=5000)
     planner = Planner(lambda source, settings: make_plan(source, settings))
     url = f"sqlite:///{tmp_path / 'jobs.sqlite'}"
-    return Jobs(url, runner, desk, planner=planner, dispatcher_options={"poll_s": 0.02}, heartbeat_s=0.05)
+    return Jobs(url, runner, desk, planner=planner, pack=pack, dispatcher_options={"poll_s": 0.02}, heartbeat_s=0.05)
+
+
+def pack(store_url: str, spec: dict[str, Any], archive: Path) -> None:
+    with zipfile.ZipFile(archive, "w") as file:
+        file.writestr("manifest.json", json.dumps([store_url, spec["scene"]]))
 
 
 @pytest.fixture
@@ -59,6 +68,36 @@ def client(jobs: Jobs, backend: Any, serve_app: Make) -> Iterator[httpx.Client]:
     with contextlib.ExitStack() as stack:
         url = stack.enter_context(serve_app(create_app("unused", make_backend=lambda: backend, jobs=jobs)))
         yield stack.enter_context(httpx.Client(base_url=url, trust_env=False, timeout=10))
+
+
+def test_dataset_of_a_job_is_a_zip_once_its_frames_are_rendered(
+    client: httpx.Client, runner: Any, wait_until: Make
+) -> None:
+    runner.may_end.clear()
+    job_id = submit(client).json()["id"]
+    assert_problem(client.get(f"/v1/jobs/{job_id}/dataset"), 409, "must have rendered its frames")
+    runner.may_end.set()
+    wait_until(lambda: client.get(f"/v1/jobs/{job_id}").json()["state"] == "complete")
+    left = lambda: set(Path(tempfile.gettempdir()).glob("lightwell-dataset-*"))  # noqa: E731
+    before = left()
+    response = client.get(f"/v1/jobs/{job_id}/dataset")
+    assert response.status_code == 200 and response.headers["content-type"] == "application/zip"
+    with zipfile.ZipFile(io.BytesIO(response.content)) as file:
+        assert json.loads(file.read("manifest.json"))[0] == "unused"
+    wait_until(lambda: left() == before)
+    baked = submit(client, stages=["bake"]).json()["id"]
+    wait_until(lambda: client.get(f"/v1/jobs/{baked}").json()["state"] == "complete")
+    assert_problem(client.get(f"/v1/jobs/{baked}/dataset"), 409, "complete with bake")
+    assert client.get("/v1/jobs/none/dataset").status_code == 404
+
+
+def test_metrics_tell_units_and_seconds_by_stage(client: httpx.Client, runner: Any) -> None:
+    runner.totals.add(Unit("bake", "diffuse", count=7), 2.5, done=True)
+    runner.totals.add(Unit("render", "train"), 4.0, done=False)
+    told = client.get("/metrics").text
+    assert 'lightwell_units_total{stage="bake"} 7.0' in told
+    assert 'lightwell_stage_seconds_total{stage="render"} 4.0' in told
+    assert 'lightwell_units_set_aside_total{stage="render"} 1.0' in told
 
 
 def submit(client: httpx.Client, **values: Any) -> httpx.Response:
