@@ -35,6 +35,7 @@ from tests.load.processes import bare as bare_renderer
 from tests.load.store import SCENES
 
 MAX_GROWTH = 0.05
+MAX_OVERHEAD = 0.15  # of the bare renderer, at the median, between two answers under load
 SETTLED_S = 60.0
 """Memory counts from here on: the first minute sees every size, scene and cache for the first time."""
 WIDTHS = "32,48,64"
@@ -205,6 +206,11 @@ def failures(figures: dict[str, Any]) -> list[str]:
     found = [f"answers must be frames or 503 with Retry-After, got {wrong}"] if wrong else []
     if figures["rss_growth_after_settling"] > MAX_GROWTH:
         found.append(f"memory must be flat, grew by {100 * figures['rss_growth_after_settling']:.1f} %")
+    overhead = figures["overhead_p50"]["time_between_answers_of_all"]
+    if overhead > MAX_OVERHEAD:
+        found.append(
+            f"the service may take {100 * MAX_OVERHEAD:.0f} % over the bare renderer, got {100 * overhead:.1f}"
+        )
     return found
 
 

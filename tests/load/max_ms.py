@@ -10,7 +10,7 @@ from a fixed seed. No two requests share a frame. One client asks, one request a
 What is promised is the time from pose to frame in memory: the "query" and "network" steps of Server-Timing. Reported
 beside it are all of the server's steps and the client's own wall time, for requests that had to prepare nothing and
 for all. Requests that no point can meet are refused (422) and counted apart. Exit code 1 where more than 5 % of the
-answered requests exceed their limit by more than 20 %.
+answered requests exceed their limit by more than 20 %, or fewer than half are answered.
 """
 
 import argparse
@@ -37,6 +37,7 @@ from workers.renderer import open_run
 
 ALLOWED_EXCESS = 0.2
 ALLOWED_SHARE = 0.05
+MIN_ANSWERED = 0.5
 LOWEST, HIGHEST = 0.7, 1.5
 NUM_SIZES = 12
 FOV_STEP = 1e-5
@@ -136,6 +137,8 @@ def failures(figures: dict[str, Any]) -> list[str]:
     found = []
     if figures["failed"]:
         found.append(f"answers must be frames or refusals (422), got {figures['failed']}")
+    if figures["answered"] < MIN_ANSWERED * figures["requests"]:
+        found.append(f"half of the requests must be answered, got {figures['answered']} of {figures['requests']}")
     late = figures["share_beyond_120_percent"]["promised"]
     if late is None:
         found.append("some request must be answered, got none")
