@@ -57,7 +57,7 @@ def throughput(folder: Path, num_workers: int) -> float:
         for _ in range(num_workers):  # a store of its own each time would load the scene again
             timed(runner, tiny_spec_until("render", WARM))
         seconds, stages, result = timed(runner, tiny_spec_until("render", WORK))
-    print(f"{num_workers} workers: {result['computed']} units in {seconds:.2f} s, stages ended at "
+    print(f"{num_workers} workers: {result['units']} units in {seconds:.2f} s, stages ended at "
           f"{ {name: round(at, 1) for name, at in stages.items()} }")  # fmt: skip
     return result["units"] / seconds
 
