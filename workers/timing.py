@@ -21,8 +21,9 @@ MATMUL_EDGE = 2048
 MATMUL_SMALLEST = 256
 MATMUL_SECONDS = 0.02
 MATMUL_REPEATS = 4
-# Of fp32's time. With instructions of its own bfloat16 takes less than once, without them a hundred times; beside another
-# process, which may hold a core all through such a short measurement, either may seem to take several times as long.
+# Of fp32's time. With instructions of its own bfloat16 takes less than once, without them a hundred times; beside
+# another process, which may hold a core all through so short a measurement, either may seem to take several times as
+# long.
 BF16_WORST = 20.0
 
 
