@@ -69,6 +69,8 @@ def variants(settings: Settings) -> list[Variant]:
         Variant("ours, 1x1 query", {"query.samples": 1}),
         Variant("ours, 2x2 query everywhere", {"query.supersample": "everywhere"}),
         Variant("ours, planned", {"plan.mode": "adaptive"}),
+        Variant("ours, planned, a quarter of the elements",
+                {"plan.mode": "adaptive", "cache.max_elements": max(1, settings.cache.max_elements // 4)}),
         Variant("ours", {}),
     ]  # fmt: skip
 
