@@ -307,7 +307,7 @@ def test_page_says_what_a_plan_saves_against_uniform_caches_on_every_triangle() 
     own = {"command": "b", "commit": "fff", "machine": "other", "width": 64, "height": 64, "preset": "tiny"}
     page = render_page([make_record(ablation=own | {"rows": ABLATION_ROWS}, selection=own | {"rows": rows})])
     assert said in section(page, "Ablation, selected rows")
-    assert "every triangle: 1/" not in section(page, "Ablation")
+    assert "every triangle: Planned" not in section(page, "Ablation")
     assert requirement(rows[:1]) == "" and requirement([rows[0] | {"psnr": None}, rows[1]]) == ""
 
 
