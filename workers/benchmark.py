@@ -178,7 +178,7 @@ def network_rate(reconstructor: Reconstructor, width: int, height: int, seconds:
     """
     multiple = reconstructor.config.size_multiple
     padded = [-(-edge // multiple) * multiple for edge in (height, width)]
-    gflop = network_flops(reconstructor.config, *padded) / 1e9
+    gflop = 0.0 if reconstructor.hands_on else network_flops(reconstructor.config, *padded) / 1e9
     choice = reconstructor.choices[f"{width}x{height}"]
     peaks = {
         "fp32": matmul_gflop_per_s(torch.float32, reconstructor.device),

@@ -195,7 +195,7 @@ def _training(settings: Settings, rates: Rates) -> StageCost:
     step_s = rates.step_s[tuple(train.widths)]
     crop = _crop(settings)
     crops = max(1, round(settings.frames.num_train * settings.width * settings.height / crop**2))
-    steps = max(1, train.epochs * -(-crops // train.batch))
+    steps = train.epochs * -(-crops // train.batch)
     seconds = steps * step_s
     limited = 0 < train.seconds < seconds
     note = f"{steps} steps of {1e3 * step_s:.0f} ms" + (f"; ended after {train.seconds:.0f} s" if limited else "")

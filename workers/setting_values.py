@@ -38,7 +38,7 @@ RANGES: Mapping[str, tuple[float, float]] = MappingProxyType(
         "train.perceptual_weight": (0, 1_000_000),
         "train.gradient_weight": (0, 1_000_000),
         "train.perceptual_every": (1, 1_000_000),
-        "train.epochs": (1, 1_000_000),
+        "train.epochs": (0, 1_000_000),
         "train.seconds": (0, 31_536_000),  # a year
         "train.batch": (1, 65_536),
         "train.crop": (1, _MOST_PX),

@@ -124,7 +124,8 @@ class TrainSettings:
         transfer: "mu_law" or "log1p" (the paper).
         l1_weight, perceptual_weight, gradient_weight: terms of the loss.
         perceptual_every: steps between two uses of the perceptual term (its weight grows alike).
-        epochs: passes over the training frames; `seconds` ends training earlier when above 0.
+        epochs: passes over the training frames; `seconds` ends training earlier when above 0. 0 trains nothing: the
+            network then hands on the caches' radiance, and costs no time in a frame.
         batch: crops per step.
         crop: crop edge in pixels.
         schedule: "paper" (x 0.95 per epoch) or "cosine" (one cycle with warm-up).
@@ -289,6 +290,8 @@ def _check(settings: Settings) -> None:
         raise SettingsError(
             f"setting 'query.weights' must be barycentric unless cache.lobes is exitant, got {settings.query.weights}"
         )
+    if settings.train.epochs == 0 and not settings.train.residual:
+        raise SettingsError("setting 'train.epochs' must be above 0 unless train.residual is set, got 0")
     if settings.train.unshuffle not in (1, 2, 4):
         raise SettingsError(f"setting 'train.unshuffle' must be 1, 2 or 4, got {settings.train.unshuffle}")
     if len(settings.train.widths) != 3:

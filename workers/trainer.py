@@ -138,8 +138,8 @@ class Trainer:
         Both are measured over a few steps, then undone and fixed, so that a resumed run keeps them.
         """
         settings = self.settings
-        full = max(1, settings.epochs * self.crops.steps_per_epoch)
-        if settings.seconds <= 0 and settings.precision == "fp32":
+        full = settings.epochs * self.crops.steps_per_epoch
+        if full == 0 or (settings.seconds <= 0 and settings.precision == "fp32"):
             return full
         seconds = {False: self._probe(full, False)}
         if settings.precision == "bf16" or (settings.precision == "auto" and bf16_is_fast(self.device)):
@@ -151,7 +151,7 @@ class Trainer:
 
     def _replan(self) -> None:
         """Fits the number of steps to the pace so far: a few probed steps may have met a busy or an idle moment."""
-        budget_s, full = self.settings.seconds, max(1, self.settings.epochs * self.crops.steps_per_epoch)
+        budget_s, full = self.settings.seconds, self.settings.epochs * self.crops.steps_per_epoch
         if budget_s > 0 and self.step <= REPLAN_UNTIL * self.num_steps:
             self.num_steps = int(np.clip(budget_s * self.step / self.spent_s, self.step, full))
 

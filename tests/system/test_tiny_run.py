@@ -10,6 +10,7 @@ import pytest
 from fastapi.testclient import TestClient
 from PIL import Image
 
+from models.network import FusionNet
 from service.app import create_app
 from service.jobs.dataset import pack_apart
 from service.jobs.planner import plan_apart
@@ -21,10 +22,11 @@ from workers.element_stage import run_elements
 from workers.errors import SceneError, WorkerError
 from workers.pipeline import evaluate_scene, published_settings, run_scene
 from workers.progress import Progress
+from workers.reconstruct import Reconstructor
 from workers.renderer import FrameRenderer, renderable_scenes
 from workers.run_state import RunState
 from workers.scene import load_scene
-from workers.settings import Settings
+from workers.settings import Settings, SettingsError
 from workers.timing import bf16_is_fast
 from workers.train import train_ref
 from workers.trainer import Trainer
@@ -141,6 +143,17 @@ def test_trainer_resumes_with_the_identical_next_loss(prepared, scene, settings,
     resumed = again()
     assert resumed.step == 3
     assert [resumed.train_step()["total"] for _ in range(2)] == expected
+
+
+def test_no_epochs_train_a_network_that_hands_on_the_caches(prepared, scene, settings):
+    trainer, _ = _trainer(prepared, scene, settings, {"train.epochs": 0})
+    trainer.fit()
+    assert (trainer.step, len(trainer.curve)) == (0, 1)
+    network = FusionNet(trainer.config)
+    network.load_state_dict(trainer.best_state())
+    assert Reconstructor(network, trainer.encoding).hands_on
+    with pytest.raises(SettingsError, match=r"train\.epochs"):
+        settings.override({"train.epochs": 0, "train.residual": False})
 
 
 @pytest.mark.parametrize(("probed_s", "later_s"), [(1.0, 0.1), (0.1, 0.3)])

@@ -1,5 +1,7 @@
 """Inference: padding, encoding round trip, the identity of an untrained network, precision's gate."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -22,6 +24,13 @@ def features() -> np.ndarray:
     return frame
 
 
+def working_network() -> FusionNet:
+    """One that corrects the imperfect radiance a little."""
+    network = FusionNet(CONFIG)
+    torch.nn.init.constant_(network.head.bias, 1e-3)
+    return network
+
+
 @pytest.mark.parametrize("curve", ["mu-law", "log1p"])
 def test_encoding_round_trips_radiance(features: np.ndarray, curve: str) -> None:
     encoding = Encoding(exposure=0.5, distance_scale=4.0, transfer=Transfer(curve=curve))
@@ -34,9 +43,25 @@ def test_encoding_round_trips_radiance(features: np.ndarray, curve: str) -> None
 
 
 def test_untrained_network_returns_the_imperfect_radiance_at_any_size(features: np.ndarray) -> None:
-    frame = Reconstructor(FusionNet(CONFIG), ENCODING, precision="fp32")(features)
+    reconstructor = Reconstructor(FusionNet(CONFIG), ENCODING, precision="fp32")
+    assert reconstructor.hands_on
+    np.testing.assert_array_equal(reconstructor(features), features[..., :3])
+    with torch.inference_mode():  # what is left out would have changed nothing
+        frame = reconstructor._fp32(torch.from_numpy(features)).numpy()
     assert frame.shape == (21, 35, 3)
     np.testing.assert_allclose(frame, features[..., :3], rtol=1e-4, atol=1e-5)
+
+
+def test_network_that_corrects_or_replaces_is_computed(features: np.ndarray) -> None:
+    correcting, replacing = FusionNet(CONFIG), FusionNet(dataclasses.replace(CONFIG, residual=False))
+    with torch.no_grad():
+        correcting.head.bias[0] = 1e-3
+        for parameter in replacing.head.parameters():
+            parameter.zero_()
+    for network in (correcting, replacing):
+        reconstructor = Reconstructor(network, ENCODING, precision="fp32")
+        assert not reconstructor.hands_on
+        assert (reconstructor(features) != features[..., :3]).any()
 
 
 def test_padding_repeats_the_edge_to_a_multiple() -> None:
@@ -59,7 +84,7 @@ def test_bf16_is_refused_where_it_would_show(features: np.ndarray) -> None:
 
 def test_non_finite_input_is_not_hidden(features: np.ndarray) -> None:
     features[4, 4, 0] = np.nan
-    frame = Reconstructor(FusionNet(CONFIG), ENCODING, precision="fp32")(features)
+    frame = Reconstructor(working_network(), ENCODING, precision="fp32")(features)
     assert not np.isfinite(frame).all()
 
 
@@ -68,7 +93,7 @@ def frame_of(height: int, width: int) -> np.ndarray:
 
 
 def test_sizes_are_remembered_up_to_a_bound_and_the_oldest_is_measured_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    reconstructor = Reconstructor(FusionNet(CONFIG), ENCODING, precision="fp32")
+    reconstructor = Reconstructor(working_network(), ENCODING, precision="fp32")
     measured: list[tuple[int, ...]] = []
     choose = reconstructor._choose
 
@@ -94,7 +119,7 @@ def test_candidates_are_measured_after_what_runs_before_a_frame(
     monkeypatch.setattr("workers.reconstruct.bf16_is_fast", lambda device: True)
     monkeypatch.setattr(Reconstructor, "_passes_gate", lambda *_: True)
     calls: list[int] = []
-    reconstructor = Reconstructor(FusionNet(CONFIG), ENCODING, precision="auto")
+    reconstructor = Reconstructor(working_network(), ENCODING, precision="auto")
     reconstructor(features, lambda: calls.append(1))
     assert len(calls) >= 2 * reconstruct.MIN_PROBE_ROUNDS
     measured = len(calls)
@@ -110,13 +135,13 @@ def test_bf16_is_not_tried_where_the_device_does_not_compute_in_it(
 
     monkeypatch.setattr(Reconstructor, "_passes_gate", refuse)
     monkeypatch.setattr("workers.reconstruct.bf16_is_fast", lambda device: False)
-    reconstructor = Reconstructor(FusionNet(CONFIG), ENCODING, precision="auto")
+    reconstructor = Reconstructor(working_network(), ENCODING, precision="auto")
     reconstructor(features)
     assert set(reconstructor.choices.values()) == {"fp32"}
 
 
 def test_sizes_share_one_copy_in_bf16() -> None:
-    reconstructor = Reconstructor(FusionNet(CONFIG), ENCODING, precision="bf16")
+    reconstructor = Reconstructor(working_network(), ENCODING, precision="bf16")
     for height in (8, 12, 16):
         reconstructor(frame_of(height, 8))
     assert set(reconstructor.choices.values()) == {"bf16"}
@@ -127,7 +152,7 @@ def test_sizes_share_one_copy_in_bf16() -> None:
 def test_no_more_sizes_are_compiled_than_torch_should_keep(monkeypatch: pytest.MonkeyPatch) -> None:
     compiled: list[object] = []
     monkeypatch.setattr(reconstruct, "_try_compile", lambda module, features: compiled.append(features.shape))
-    reconstructor = Reconstructor(FusionNet(CONFIG), ENCODING, precision="fp32", compile=True)
+    reconstructor = Reconstructor(working_network(), ENCODING, precision="fp32", compile=True)
     for extra in range(MAX_COMPILED + 3):
         reconstructor(frame_of(8, 8 + extra))
     assert len(compiled) == len(set(compiled)) == MAX_COMPILED
