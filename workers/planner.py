@@ -26,7 +26,7 @@ from workers.settings import Settings
 from workers.visibility import domain_hits
 
 # Part of the keys of stored plans; raise it whenever the same scene and settings give other decisions.
-PLANNER_VERSION = (2, PILOT_VERSION)
+PLANNER_VERSION = (1, PILOT_VERSION)
 CENSUS_RAYS_PER_POSE = RAYS_PER_POSE // 4
 CEILING = 2
 LOWEST_DIFFUSE_SPP, LOWEST_DIRECTIONAL_SPP = 64, 1
@@ -158,10 +158,11 @@ class _Planner:
         if directional == 0 and predicted >= NO_NETWORK_DB and self.settings.cache.lobes == "split":
             reason = (
                 f"purely diffuse, and the caches alone are predicted at {shown} (bound {NO_NETWORK_DB:.0f} dB): "
-                "the frame needs no network, and none is trained"
+                "the frame needs no network but for what one sample a pixel leaves jagged; a run trains the smallest, "
+                "with train.epochs=0 none"
             )
-            values = {"train.widths": SMALLEST_WIDTHS, "train.epochs": 0}
-            self._choose("network", values, lambda v: f"not needed; {v['train.epochs']} epochs", reason)
+            values = {"train.widths": SMALLEST_WIDTHS}
+            self._choose("network", values, lambda v: f"not needed; widths {v['train.widths']}", reason)
             return False
         cause = f"{100 * directional:.0f} % of what is seen is glossy or delta" if directional else (
             f"the caches alone are predicted at {shown}, below {NO_NETWORK_DB:.0f} dB")  # fmt: skip
