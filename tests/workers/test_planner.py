@@ -80,7 +80,7 @@ def test_scene_without_glossy_materials_has_no_directions(plain: Decision) -> No
     assert not plain.network_needed and "not needed" in choice(plain, "network").choice
     wide = decided_again(plain, small().override({"train.widths": (32, 48, 64)}))
     assert wide.overrides["train.widths"] == (16, 16, 16)
-    assert "train.epochs" not in wide.overrides, "the prediction is not sure enough to train none"
+    assert "train.epochs" not in wide.overrides, "to train none is for people to say"
     paper = decided_again(plain, small(**{"cache.lobes": "exitant"}))
     assert paper.network_needed, "the paper's caches are never enough"
 
