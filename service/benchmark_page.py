@@ -5,8 +5,8 @@ from typing import Any
 
 from service import scores, trade, tradeoff
 from service.ablations import HEAD, LEGEND, ablation_cells, requirement
+from service.cost_curves import CURVES, exponent_cells, exponent_head, kind_title, remarks, row_cells, sentence
 from service.cost_curves import HEAD as CURVES_HEAD
-from service.cost_curves import exponent_cells, exponent_head, kind_title, remarks, row_cells, sentence
 from service.scores import human_bytes, human_seconds
 
 Record = Mapping[str, Any]
@@ -222,6 +222,7 @@ def _cost_curves(curves: Sequence[Record]) -> list[str]:
             lines += table(head, (row_cells(row) for row in own))
         fits = result["exponents"]
         lines += table(exponent_head(fits), exponent_cells(fits))
+        lines += [f"![{record['scene']}: costs against triangles]({CURVES.folder}/{record['scene']}.png)", ""]
         lines += [*(f"- {_cell(remark.removeprefix('note: '))}" for remark in remarks(result)), ""]
     return lines
 

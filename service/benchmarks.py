@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from service.ablations import measure_ablation
 from service.benchmark_page import render_page
 from service.cost_curves import CURVES
+from service.cost_curves_plot import cost_curves_plot
 from service.errors import ServiceError
 from service.options import write_file
 from service.outcome import json_values
@@ -229,9 +230,9 @@ def write_page(store: "Store", output: Path) -> int:
         if record.get("measured_at", "") >= older.get("measured_at", ""):
             kept = _ablations(older) if older.get("digest") == record["digest"] else {}
             save(beside, kept | record)
-    CURVES.copy(store.files, beside)
-    for record in TRADES.copy(store.files, beside):
-        beside.write(f"{TRADES.folder}/{record['scene']}.png", tradeoff_plot(record["result"], ".png"))
+    for kind, plot in ((CURVES, cost_curves_plot), (TRADES, tradeoff_plot)):
+        for record in kind.copy(store.files, beside):
+            beside.write(f"{kind.folder}/{record['scene']}.png", plot(record["result"], ".png"))
     records = load_all(beside)
     write_file(output, render_page(records, CURVES.load(beside), TRADES.load(beside)).encode())
     return len(records)

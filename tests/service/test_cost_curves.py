@@ -73,6 +73,7 @@ def test_record_returns_as_it_went_and_stands_on_the_page(result: dict[str, Any]
     assert "## Cost curves" in page and "lightwell cost-curves hall" in page and "a \\| note" in page
     assert "| bake, paths | 0.00 ± 0.00 | 1.00 ± 0.00 |" in page
     assert "No scene has been measured yet" not in page
+    assert "(cost-curves/hall.png)" in page and (tmp_path / "cost-curves" / "hall.png").read_bytes()[1:4] == b"PNG"
     rows = [line for line in page.splitlines() if line.startswith("| 10,000")]
     assert len(rows) == 2
 
