@@ -157,7 +157,8 @@ def _is_served(store_url: str, folder: Path) -> bool:
         entries = Store.open(store_url).scenes()
     except StoreNotFoundError:
         return False
-    return any(Path(str(entry.get("source", ""))).is_relative_to(folder) for entry in entries)
+    absolute = folder.resolve()  # as entries have it; the service may have been given a relative folder
+    return any(Path(str(entry.get("source", ""))).is_relative_to(absolute) for entry in entries)
 
 
 def _add_configured(app: FastAPI, config: ServiceConfig, jobs: "Jobs | None", store_url: str) -> None:

@@ -233,6 +233,19 @@ def test_a_bundle_whose_scene_is_served_is_not_deleted(client: TestClient, confi
     assert client.delete(f"/v1/bundles/{bundle['id']}").status_code == 204
 
 
+def test_a_served_bundle_of_a_store_given_by_a_relative_path_is_not_deleted(
+    tmp_path: Path, backend: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = ServiceConfig(store_url="store")
+    app = create_app(config.store_url, make_backend=lambda: backend, config=config)
+    with TestClient(app, base_url="http://localhost") as client:
+        bundle = accepted(client, {"scene.xml": xml("")})
+        source = (config.bundles_path / bundle["id"] / "scene.xml").resolve()
+        Store.open(config.store_url, create=True).register_scene("d1", {"name": "hall", "source": str(source)})
+        assert client.delete(f"/v1/bundles/{bundle['id']}").status_code == 409
+
+
 def test_what_a_crash_left_is_swept_and_what_is_being_received_is_not(config: ServiceConfig) -> None:
     store = bundle_store(config)
     with store.receiving() as incoming:
