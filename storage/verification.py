@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from storage import layout, markers, quarantine, scenes
+from storage import layout, markers, quarantine, scenes, tradeoffs
 from storage.errors import DamagedUnitError, PathNameError
 from storage.layout import UnitRef
 
@@ -108,6 +108,12 @@ def _scene_problems(store: "Store", digest: str, sizes: Sizes) -> Iterator[Probl
             yield Problem(str(error), (path,))
     elif stages:
         yield Problem(f"{store.files.path(path)} is missing: this is no registered scene; run the scene again")
+    trade = layout.tradeoff_file(digest)
+    if trade in sizes:
+        try:
+            tradeoffs.parse(store.files, trade, store.files.read(trade))
+        except DamagedUnitError as error:
+            yield Problem(str(error), (trade,))
     for stage, inside in stages.items():
         units = {UnitRef(digest, stage, key): sizes for key, sizes in _by_folder(inside, depth=3).items()}
         yield from _stage_problems(store, units)

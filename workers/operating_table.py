@@ -1,10 +1,11 @@
-"""A scene's measured trade at rest: its operating points and every row that they were compared to, as one JSON
-file beside the scene (`storage.layout.tradeoff_file`)."""
+"""A scene's measured trade: its operating points and every row that they were compared to, kept beside the scene
+(`storage/tradeoffs.py`)."""
 
-import json
 from dataclasses import dataclass
 from typing import Any
 
+from storage import tradeoffs
+from storage.errors import DamagedUnitError
 from storage.layout import tradeoff_file
 from storage.store import Store
 from workers.errors import NoOperatingPointsError, OperatingPointError
@@ -46,7 +47,7 @@ class OperatingTable:
 
 def save_table(store: Store, digest: str, table: OperatingTable) -> None:
     """Keeps a scene's table in place of an older one."""
-    store.files.write(tradeoff_file(digest), json.dumps(table.to_json(), indent=1, allow_nan=False).encode())
+    tradeoffs.write(store.files, digest, table.to_json())
 
 
 def load_table(store: Store, digest: str) -> OperatingTable:
@@ -54,16 +55,18 @@ def load_table(store: Store, digest: str) -> OperatingTable:
 
     Raises:
         NoOperatingPointsError: the scene's trade was never measured in this store.
-        OperatingPointError: the file is not ours.
+        OperatingPointError: the file is not the one that was written, or of another version.
     """
-    data = store.files.read(tradeoff_file(digest))
-    if data is None:
+    try:
+        value = tradeoffs.read(store.files, digest)
+    except DamagedUnitError as error:
+        raise OperatingPointError(str(error)) from error
+    if value is None:
         raise NoOperatingPointsError(
             f"scene {digest} must have measured operating points, got no {tradeoff_file(digest)}; "
             f"run: lightwell tradeoff SCENE --store {store.url}"
         )
     try:
-        value = json.loads(data)
         if value["schema"] != SCHEMA:
             raise ValueError(f"schema {value['schema']}")
         points = tuple(OperatingPoint.from_json(point) for point in value["points"])

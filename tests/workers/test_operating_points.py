@@ -1,5 +1,6 @@
 """The choice of an operating point: the model of time, every demand, refusals, and the file at rest."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 
 from storage.layout import tradeoff_file
 from storage.store import Store
+from storage.verification import find_problems, repair
 from workers.errors import NoOperatingPointsError, OperatingPointError, UnreachableTargetError
 from workers.operating_points import FrameDemand, FrameTime, OperatingPoint, choose, time_model
 from workers.operating_table import OperatingTable, load_table, save_table
@@ -172,6 +174,28 @@ def test_table_that_is_not_ours_is_named(store: Store, data: bytes) -> None:
     store.files.write(tradeoff_file("d1"), data)
     with pytest.raises(OperatingPointError, match=r"tradeoff\.json"):
         load_table(store, "d1")
+
+
+def test_verify_finds_a_damaged_table_and_repair_takes_it_away(store: Store) -> None:
+    save_table(store, "d1", OperatingTable(base={"width": 64}, points=tuple(POINTS), result={"rows": []}))
+    whole = store.files.read(tradeoff_file("d1"))
+    assert whole is not None
+    store.files.write(tradeoff_file("d1"), whole.replace(b"31.5", b"91.5"))
+    (problem,) = find_problems(store)
+    assert "lightwell tradeoff" in problem.text
+    with pytest.raises(OperatingPointError, match="checksum"):
+        load_table(store, "d1")
+    assert repair(store, problem)
+    assert store.verify() == []
+    with pytest.raises(NoOperatingPointsError):
+        load_table(store, "d1")
+
+
+def test_table_of_a_version_without_checksums_is_still_read(store: Store) -> None:
+    table = OperatingTable(base={"width": 64}, points=tuple(POINTS), result={"rows": []})
+    store.files.write(tradeoff_file("d1"), json.dumps(table.to_json()).encode())
+    assert load_table(store, "d1") == table
+    assert store.verify() == []
 
 
 def test_point_of_an_unknown_name_lists_the_known() -> None:
