@@ -15,9 +15,14 @@ CHANNEL_GRANULE = 16
 """bfloat16 kernels work on blocks of 16 channels; other counts are padded up to it at full cost."""
 
 
-def _conv(in_channels: int, out_channels: int, *, stride: int = 1) -> nn.Sequential:
-    """3x3 convolution and ReLU."""
-    return nn.Sequential(nn.Conv2d(in_channels, out_channels, 3, stride, 1), nn.ReLU())
+def _activation(negative_slope: float) -> nn.Module:
+    """ReLU where the slope is 0."""
+    return nn.LeakyReLU(negative_slope) if negative_slope else nn.ReLU()
+
+
+def _conv(in_channels: int, out_channels: int, negative_slope: float, *, stride: int = 1) -> nn.Sequential:
+    """3x3 convolution and activation."""
+    return nn.Sequential(nn.Conv2d(in_channels, out_channels, 3, stride, 1), _activation(negative_slope))
 
 
 def _round_channels(channels: float) -> int:
@@ -48,11 +53,11 @@ class FusionBlock(nn.Module):
     features; the sum and the G-buffer features are concatenated and recalibrated by squeeze-and-excitation.
     """
 
-    def __init__(self, width: int) -> None:
+    def __init__(self, width: int, negative_slope: float = 0.0) -> None:
         super().__init__()
         squeezed = max(CHANNEL_GRANULE, width // 2 // CHANNEL_GRANULE * CHANNEL_GRANULE)
         self.residual = nn.Sequential(
-            nn.Conv2d(width, squeezed, 1), nn.ReLU(), nn.Conv2d(squeezed, width, 3, padding=1)
+            nn.Conv2d(width, squeezed, 1), _activation(negative_slope), nn.Conv2d(squeezed, width, 3, padding=1)
         )
         self.recalibrate = SqueezeExcitation(2 * width)
 
@@ -71,14 +76,15 @@ class FusionEncoder(nn.Module):
     The IR branch is two convolutions deep a scale, the clean G-buffers' one.
     """
 
-    def __init__(self, ir_channels: int, gbuffer_channels: int, widths: tuple[int, ...]) -> None:
+    def __init__(self, ir_channels: int, gbuffer_channels: int, widths: tuple[int, ...], negative_slope: float) -> None:
         super().__init__()
         self.ir, self.gbuffer, self.fusion = nn.ModuleList(), nn.ModuleList(), nn.ModuleList()
         for scale, width in enumerate(widths):
             stride = 1 if scale == 0 else 2
-            self.ir.append(nn.Sequential(*_conv(ir_channels, width, stride=stride), *_conv(width, width)))
-            self.gbuffer.append(_conv(gbuffer_channels, width, stride=stride))
-            self.fusion.append(FusionBlock(width))
+            first = _conv(ir_channels, width, negative_slope, stride=stride)
+            self.ir.append(nn.Sequential(*first, *_conv(width, width, negative_slope)))
+            self.gbuffer.append(_conv(gbuffer_channels, width, negative_slope, stride=stride))
+            self.fusion.append(FusionBlock(width, negative_slope))
             ir_channels = gbuffer_channels = width
         self.skip_channels = tuple(2 * width for width in widths)
 
@@ -98,14 +104,15 @@ class ConcatenateEncoder(nn.Module):
     It is sqrt(2) times wider than a branch of `FusionEncoder`, which costs about the same as the two.
     """
 
-    def __init__(self, ir_channels: int, gbuffer_channels: int, widths: tuple[int, ...]) -> None:
+    def __init__(self, ir_channels: int, gbuffer_channels: int, widths: tuple[int, ...], negative_slope: float) -> None:
         super().__init__()
         self.stages = nn.ModuleList()
         in_channels = ir_channels + gbuffer_channels
         self.skip_channels = tuple(_round_channels(math.sqrt(2.0) * width) for width in widths)
         for scale, width in enumerate(self.skip_channels):
             stride = 1 if scale == 0 else 2
-            self.stages.append(nn.Sequential(*_conv(in_channels, width, stride=stride), *_conv(width, width)))
+            first = _conv(in_channels, width, negative_slope, stride=stride)
+            self.stages.append(nn.Sequential(*first, *_conv(width, width, negative_slope)))
             in_channels = width
 
     def forward(self, ir: Tensor, gbuffer: Tensor) -> list[Tensor]:
@@ -120,13 +127,13 @@ class ConcatenateEncoder(nn.Module):
 class Decoder(nn.Module):
     """From the coarsest scale up: narrow by 1x1, double by repetition, concatenate the skip, merge by 3x3."""
 
-    def __init__(self, skip_channels: tuple[int, ...], widths: tuple[int, ...]) -> None:
+    def __init__(self, skip_channels: tuple[int, ...], widths: tuple[int, ...], negative_slope: float) -> None:
         super().__init__()
-        self.bottom = _conv(skip_channels[-1], widths[-1])
+        self.bottom = _conv(skip_channels[-1], widths[-1], negative_slope)
         # Coarse to fine. The 1x1 runs before the upsampling, at a quarter of the pixels.
         scales = range(len(widths) - 2, -1, -1)
         self.narrow = nn.ModuleList(nn.Conv2d(widths[s + 1], widths[s], 1) for s in scales)
-        self.merge = nn.ModuleList(_conv(widths[s] + skip_channels[s], widths[s]) for s in scales)
+        self.merge = nn.ModuleList(_conv(widths[s] + skip_channels[s], widths[s], negative_slope) for s in scales)
 
     def forward(self, skips: list[Tensor]) -> Tensor:
         """Skips B,C,H,W finest first. Returns B,widths[0],H,W at the finest scale."""

@@ -42,6 +42,8 @@ class NetworkConfig:
             inputs together).
         unshuffle: Edge in pixels of the blocks folded into channels before the first convolution: 1, 2 or 4.
         residual: Add the imperfect radiance to the output, so that an untrained network returns it unchanged.
+        negative_slope: Slope of the activation below 0, in [0, 1); 0 is ReLU, whose units can die: on noisy
+            targets those of the last layer did before its zero-initialised head had learned to use them.
 
     Raises:
         ConfigError: A value outside the above.
@@ -53,6 +55,7 @@ class NetworkConfig:
     fusion: Literal["fuse", "concatenate"] = "fuse"
     unshuffle: int = 2
     residual: bool = True
+    negative_slope: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "widths", tuple(self.widths))
@@ -66,6 +69,8 @@ class NetworkConfig:
             raise ConfigError(f'fusion must be "fuse" or "concatenate", got {self.fusion!r}')
         if self.unshuffle not in (1, 2, 4):
             raise ConfigError(f"unshuffle must be 1, 2 or 4, got {self.unshuffle}")
+        if not 0.0 <= self.negative_slope < 1.0:
+            raise ConfigError(f"negative_slope must be in [0, 1), got {self.negative_slope}")
 
     @classmethod
     def paper_exact(cls, *, gbuffer_channels: int = 7) -> NetworkConfig:
@@ -90,8 +95,9 @@ class FusionNet(nn.Module):
         self.config = config
         block = config.unshuffle**2
         encoder = FusionEncoder if config.fusion == "fuse" else ConcatenateEncoder
-        self.encoder = encoder(config.ir_channels * block, config.gbuffer_channels * block, config.widths)
-        self.decoder = Decoder(self.encoder.skip_channels, config.widths)
+        slope = config.negative_slope
+        self.encoder = encoder(config.ir_channels * block, config.gbuffer_channels * block, config.widths, slope)
+        self.decoder = Decoder(self.encoder.skip_channels, config.widths, slope)
         self.head = nn.Conv2d(config.widths[0], RADIANCE_CHANNELS * block, 3, padding=1)
         if config.residual:
             for parameter in self.head.parameters():

@@ -34,6 +34,8 @@ PAPER: dict[str, Any] = {
     "cache.elements": "triangle", "cache.lobes": "exitant", "cache.azimuth": 64, "cache.polar": 16,
     "query.weights": "paper", "query.samples": 1, "train.transfer": "log1p", "train.residual": False,
     "train.unshuffle": 1, "train.widths": (32, 48, 64), "train.schedule": "paper",
+    "train.perceptual_weight": 0.03, "train.learning_rate": 1e-3, "train.clip_quantile": 1.0,
+    "train.negative_slope": 0.0,
 }  # fmt: skip
 _PAPER_CACHE = {key: value for key, value in PAPER.items() if not key.startswith("train.")}
 
@@ -64,7 +66,8 @@ def variants(settings: Settings) -> list[Variant]:
         Variant("ours, no demodulation", {"cache.demodulate": False}),
         Variant("ours, blocks of 4x4 pixels", {"train.unshuffle": 4, "train.widths": (48, 64, 96)}),
         Variant("ours, concatenation", {"train.fusion": "concatenate"}),
-        Variant("ours, L1 only", {"train.perceptual_weight": 0.0}),
+        Variant("ours, with the perceptual term", {"train.perceptual_weight": 0.03}),
+        Variant("ours, ReLU", {"train.negative_slope": 0.0}),
         Variant("ours, perceptual only", {"train.l1_weight": 0.0, "train.perceptual_weight": 1.0}),
         Variant("ours, 1x1 query", {"query.samples": 1}),
         Variant("ours, 2x2 query everywhere", {"query.supersample": "everywhere"}),

@@ -215,6 +215,7 @@ def step_seconds(settings: Settings) -> float:
     config = NetworkConfig(
         gbuffer_channels=CHANNELS["distance"][1] - CHANNELS["normal"][0], widths=train.widths,  # type: ignore[arg-type]
         fusion=train.fusion, unshuffle=train.unshuffle, residual=train.residual,
+        negative_slope=train.negative_slope,
     )  # fmt: skip
     network = channels_last(FusionNet(config))
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-4)

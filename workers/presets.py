@@ -19,7 +19,7 @@ PRESET_OVERRIDES: dict[str, dict[str, Any]] = {
     "demo": {
         "width": 256, "height": 256, "cache.max_elements": 40_000, "cache.diffuse_spp": 512,
         "frames.num_train": 24, "frames.num_validation": 3, "frames.num_test": 4, "frames.train_spp": 64,
-        "frames.test_spp": 512, "train.seconds": 200.0,
+        "frames.test_spp": 512, "train.seconds": 120.0,
     },
     "tiny": {
         "width": 64, "height": 64, "cache.max_elements": 1500, "cache.domain_poses": 4, "cache.diffuse_spp": 64,

@@ -44,6 +44,8 @@ RANGES: Mapping[str, tuple[float, float]] = MappingProxyType(
         "train.crop": (1, _MOST_PX),
         "train.learning_rate": (1e-9, 10),
         "train.clip_norm": (1e-6, 1_000_000),
+        "train.clip_quantile": (0, 1),
+        "train.negative_slope": (0, 0.99),
         "evaluation.spp": (1, _MOST_SPP),
         "evaluation.timing_repeats": (1, 100_000),
         "plan.noise": (1e-4, 10.0),

@@ -130,6 +130,9 @@ class TrainSettings:
         crop: crop edge in pixels.
         schedule: "paper" (x 0.95 per epoch) or "cosine" (one cycle with warm-up).
         learning_rate: Adam's.
+        clip_norm, clip_quantile: gradients are clipped to the smaller of `clip_norm` and this quantile of the norms of
+            the last steps (1: never below what was).
+        negative_slope: of the network's activation; 0 is ReLU.
         precision: of training and inference: "fp32", "bf16" or "auto" (measured).
     """
 
@@ -139,16 +142,18 @@ class TrainSettings:
     residual: bool = True
     transfer: Literal["mu_law", "log1p"] = "mu_law"
     l1_weight: float = 1.0
-    perceptual_weight: float = 0.03
+    perceptual_weight: float = 0.0
     gradient_weight: float = 0.0
     perceptual_every: int = 4
     epochs: int = 400
-    seconds: float = 480.0
+    seconds: float = 240.0
     batch: int = 4
     crop: int = 128
     schedule: Literal["paper", "cosine"] = "cosine"
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     clip_norm: float = 1.0
+    clip_quantile: float = 0.5
+    negative_slope: float = 0.2
     precision: Literal["fp32", "bf16", "auto"] = "auto"
 
 

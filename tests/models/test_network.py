@@ -154,6 +154,18 @@ def test_config_survives_json() -> None:
     assert NetworkConfig(**json.loads(json.dumps(dataclasses.asdict(config)))) == config
 
 
+@pytest.mark.parametrize("fusion", ["fuse", "concatenate"])
+def test_slope_reaches_every_activation_and_a_record_without_one_is_relu(fusion: str) -> None:
+    leaky = FusionNet(NetworkConfig(fusion=fusion, negative_slope=0.2, **SMALL))
+    old = dataclasses.asdict(leaky.config)
+    del old["negative_slope"]
+    plain = FusionNet(NetworkConfig(**old))
+    slopes = [module.negative_slope for module in leaky.modules() if isinstance(module, nn.LeakyReLU)]
+    assert slopes == [0.2] * sum(isinstance(module, nn.ReLU) for module in plain.modules())
+    assert not any(isinstance(module, nn.ReLU) for module in leaky.modules())
+    plain.load_state_dict(leaky.state_dict())
+
+
 @pytest.mark.parametrize(
     "values",
     [
@@ -164,6 +176,8 @@ def test_config_survives_json() -> None:
         {"widths": (0, 16, 16)},
         {"fusion": "add"},
         {"unshuffle": 3},
+        {"negative_slope": -0.1},
+        {"negative_slope": 1.0},
     ],
 )
 def test_config_rejects_values_outside_its_rules(values: dict) -> None:

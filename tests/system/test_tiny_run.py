@@ -7,6 +7,7 @@ import zipfile
 
 import numpy as np
 import pytest
+import torch
 from fastapi.testclient import TestClient
 from PIL import Image
 
@@ -143,6 +144,18 @@ def test_trainer_resumes_with_the_identical_next_loss(prepared, scene, settings,
     resumed = again()
     assert resumed.step == 3
     assert [resumed.train_step()["total"] for _ in range(2)] == expected
+
+
+def test_gradients_are_clipped_at_what_is_usual(prepared, scene, settings):
+    trainer, _ = _trainer(prepared, scene, settings, {"train.clip_quantile": 0.5, "train.clip_norm": 0.5})
+    assert [trainer._clip_at(norm) for norm in (0.1, 0.3, 0.2)] == pytest.approx([0.1, 0.2, 0.2])
+    assert [trainer._clip_at(1e6) for _ in range(9)][-1] == 0.5
+    trainer.norms.clear()
+    trainer.norms.extend([1e-9] * 500)  # what is usual is hardly anything: a step moves the optimizer's mean as much
+    trainer.num_steps = 10
+    trainer.train_step()
+    means = [state["exp_avg"] for state in trainer.optimizer.state.values()]
+    assert 0 < float(torch.stack([mean.norm() for mean in means]).norm()) <= 1.01e-10
 
 
 def test_no_epochs_train_a_network_that_hands_on_the_caches(prepared, scene, settings):
