@@ -53,7 +53,7 @@ class FusionBlock(nn.Module):
     features; the sum and the G-buffer features are concatenated and recalibrated by squeeze-and-excitation.
     """
 
-    def __init__(self, width: int, negative_slope: float = 0.0) -> None:
+    def __init__(self, width: int, negative_slope: float) -> None:
         super().__init__()
         squeezed = max(CHANNEL_GRANULE, width // 2 // CHANNEL_GRANULE * CHANNEL_GRANULE)
         self.residual = nn.Sequential(

@@ -133,7 +133,7 @@ def test_network_exports_as_one_graph() -> None:
 
 
 def test_fusion_block_with_silent_residual_passes_the_ir_branch() -> None:
-    block = FusionBlock(16)
+    block = FusionBlock(16, 0.0)
     for parameter in block.residual.parameters():
         nn.init.zeros_(parameter)
     ir, gbuffer = torch.rand(1, 16, 8, 8), torch.rand(1, 16, 8, 8)

@@ -1,5 +1,9 @@
 """Built-in scenes: size, light, determinism, and exact shapes of the code-made meshes."""
 
+import json
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -67,3 +71,14 @@ def test_mesh_normals_are_unit_and_outward(mesh: MeshArrays) -> None:
     assert ((facing * mesh.normals[mesh.faces].mean(1)).sum(1) > 0).all()
     assert (np.linalg.norm(facing, axis=1) > 0).all()
     assert mesh.texcoords.min() >= 0 and mesh.texcoords.max() <= 1
+
+
+def test_frame_that_the_readme_asks_for_is_seen_from_where_tabletop_was_baked() -> None:
+    text = (Path(__file__).parents[2] / "README.md").read_text()
+    body = re.search(r"-d '(\{.*\})' \\\n.*/v1/scenes/tabletop/frame", text)
+    assert body is not None
+    asked = json.loads(body[1])["camera"]["look_at"]
+    own = load_scene("tabletop").camera.to_world
+    forward = np.subtract(asked["target"], asked["origin"])
+    assert np.linalg.norm(asked["origin"] - own[:3, 3]) < 0.05
+    assert forward / np.linalg.norm(forward) @ own[:3, 2] > 0.999
